@@ -1,0 +1,31 @@
+"""Visual-navigation reinforcement learning for a small lunar rover, on MuJoCo / MJX and JAX.
+
+``make_env`` builds the environment; ``train`` trains a policy; ``load_policy`` reads a trained one. Names are imported
+when they are first used, so that importing the package is quick and touches no device.
+"""
+
+import importlib
+from typing import Any
+
+_PUBLIC = {
+    "ConfigError": "segvisrl_jax.config",
+    "EnvConfig": "segvisrl_jax.config",
+    "RoverEnv": "segvisrl_jax.env.rover_env",
+    "TrainConfig": "segvisrl_jax.config",
+    "downsample": "segvisrl_jax.vision.resample",
+    "load_policy": "segvisrl_jax.training.checkpoint",
+    "make_env": "segvisrl_jax.env.rover_env",
+    "preset_config": "segvisrl_jax.config",
+    "train": "segvisrl_jax.training.loop",
+}
+__all__ = sorted(_PUBLIC)  # noqa: PLE0605
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_PUBLIC[name]), name)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *_PUBLIC]

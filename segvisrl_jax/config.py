@@ -13,6 +13,7 @@ Arch = Literal["cnn_lstm", "cnn", "cnn_lstm_raw", "mlp"]
 ObservationKind = Literal["segmentation", "rgb", "state"]
 RendererName = Literal["auto", "scanline", "gl"]
 EngineName = Literal["auto", "native", "mjx"]
+PresetName = Literal["paper", "cpu", "gpu", "smoke"]
 
 
 class ConfigError(ValueError):
@@ -351,6 +352,144 @@ class PPOConfig:
             require(value >= 0, f"{p}.{name}", value, "0 or more")
 
 
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """Held-out evaluation while training: on validation scenes, with deterministic actions."""
+
+    every_decisions: int = 40_960
+    """Training decisions between two evaluations (rounded up to whole updates)."""
+    episodes: int = 200
+    """Episodes of each."""
+    num_slots: int = 64
+    """Episodes that are driven at the same time; the scenes are the same for any number."""
+
+    def __post_init__(self) -> None:
+        p = "evaluation"
+        _require_finite_numbers(self, p)
+        require(self.every_decisions >= 1, f"{p}.every_decisions", self.every_decisions, "1 or more")
+        require(1 <= self.episodes <= 10**7, f"{p}.episodes", self.episodes, "in [1, 10000000]")
+        require(1 <= self.num_slots <= 10**5, f"{p}.num_slots", self.num_slots, "in [1, 100000]")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One training run."""
+
+    arch: Arch = "cnn_lstm"
+    """cnn_lstm, cnn: segmented images, with and without memory; cnn_lstm_raw: colour images; mlp: the true state."""
+    preset: PresetName = "cpu"
+    """Where the defaults came from."""
+    seed: int = 0
+    steps: int = 327_680
+    """Training decisions in all (rounded up to whole updates)."""
+    run: str = ""
+    """Name of the run's folder; empty: made from arch, preset and seed."""
+    runs_dir: str = "runs"
+    """Where run folders go."""
+    resume: bool = False
+    """Go on from the run folder's last checkpoint."""
+    checkpoint_every_updates: int = 8
+    env: EnvConfig = field(default_factory=EnvConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+
+    @property
+    def run_name(self) -> str:
+        """The run folder's name."""
+        return self.run or f"{self.arch}-{self.preset}-seed{self.seed}"
+
+    @property
+    def num_updates(self) -> int:
+        """Updates that ``steps`` come to."""
+        return -(-self.steps // self.ppo.decisions_per_update)
+
+    def __post_init__(self) -> None:
+        _require_choice(self.arch, Arch, "arch")
+        _require_choice(self.preset, PresetName, "preset")
+        for name in ("seed", "steps", "checkpoint_every_updates"):
+            value = getattr(self, name)
+            require(type(value) is int, name, value, "a whole number")
+        require(0 <= self.seed < 2**31, "seed", self.seed, "in [0, 2^31)")
+        require(1 <= self.steps <= 10**12, "steps", self.steps, "in [1, 10^12]")
+        require(self.checkpoint_every_updates >= 1, "checkpoint_every_updates", self.checkpoint_every_updates, "1 or more")
+        is_plain = isinstance(self.run, str) and "/" not in self.run and self.run not in (".", "..") and "\0" not in self.run
+        require(is_plain, "run", self.run, "a folder's name without slashes")
+        seen = ARCH_OBSERVATION[self.arch]
+        require(self.env.obs == seen, "env.obs", self.env.obs, f"{seen} for arch {self.arch}")
+
+
+ARCH_OBSERVATION: dict[str, ObservationKind] = {
+    "cnn_lstm": "segmentation",
+    "cnn": "segmentation",
+    "cnn_lstm_raw": "rgb",
+    "mlp": "state",
+}
+"""What each architecture reads."""
+
+_PRESETS: dict[str, dict[str, Any]] = {
+    # The paper's table I; where it is silent, this project's defaults.
+    "paper": {
+        "steps": 5_000_000,
+        "scale": 10.0,
+        "num_envs": 1,
+        "unroll_length": 64,
+        "num_minibatches": 1,
+        "num_epochs": 4,
+        "learning_rate": 3e-4,
+        "final_learning_rate_share": 1.0,
+        "discount": 0.85,
+        "entropy_cost": 0.01,
+        "kl_stop": 0.0,
+        "reward_scale": 1.0,
+        "bounded_mean": False,
+        "initial_std": 1.0,
+        "every_decisions": 102_400,
+        "checkpoint_every_updates": 200,
+    },
+    # A 48 x 27 image: 16 times less work for the network than 192 x 108, with goal and rocks still in view at 16 m.
+    "cpu": {"steps": 327_680, "scale": 40.0, "random_start_yaw_share": 0.5},
+    # The paper's image over many environments: large batches fill an accelerator.
+    "gpu": {
+        "steps": 5_000_000,
+        "scale": 10.0,
+        "random_start_yaw_share": 0.5,
+        "num_envs": 512,
+        "num_minibatches": 16,
+        "unroll_length": 64,
+        "every_decisions": 327_680,
+        "episodes": 500,
+        "num_slots": 500,
+    },
+    # Everything once, at a size that only shows that it runs.
+    "smoke": {
+        "steps": 512,
+        "scale": 120.0,
+        "num_envs": 4,
+        "unroll_length": 32,
+        "num_minibatches": 2,
+        "num_epochs": 2,
+        "every_decisions": 256,
+        "episodes": 8,
+        "num_slots": 8,
+        "checkpoint_every_updates": 1,
+    },
+}
+
+
+def preset_config(arch: str, preset: str) -> TrainConfig:
+    """The settings of a preset for an architecture.
+
+    Raises:
+        ConfigError: for an architecture or preset that does not exist.
+    """
+    _require_choice(arch, Arch, "arch")
+    _require_choice(preset, PresetName, "preset")
+    env = EnvConfig(obs=ARCH_OBSERVATION[arch])
+    base = TrainConfig(arch=arch, preset=preset, env=env)  # type: ignore[arg-type]
+    return replace_fields(base, **_PRESETS[preset])
+
+
 ConfigT = TypeVar("ConfigT")
 
 
@@ -393,3 +532,31 @@ def _refuse_unknown(name: str, known: list[str]) -> None:
     near = difflib.get_close_matches(name, known, n=3)
     hint = f"did you mean {' or '.join(near)}?" if near else "known: " + ", ".join(sorted(known))
     raise ConfigError(f"{name}: no such setting; {hint}")
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """A config as plain JSON data."""
+    return {name: list(v) if isinstance(v, tuple) else v for name, v in _shallow(config)}
+
+
+def _shallow(config: Any) -> list[tuple[str, Any]]:
+    fields = [(f.name, getattr(config, f.name)) for f in dataclasses.fields(config)]
+    return [(name, to_dict(v) if dataclasses.is_dataclass(v) else v) for name, v in fields]
+
+
+def from_dict(kind: type[ConfigT], data: Any, where: str = "config") -> ConfigT:
+    """The config that ``to_dict`` wrote.
+
+    Raises:
+        ConfigError: for data of another shape, a field that does not exist, or a value that its part refuses.
+    """
+    require(isinstance(data, dict), where, data, "an object with settings")
+    known = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    values = {}
+    for name, value in data.items():
+        require(name in known, f"{where}.{name}", value, "left out: no such setting")
+        part = known[name].default_factory
+        is_part = part is not dataclasses.MISSING
+        value = tuple(value) if isinstance(value, list) else value
+        values[name] = from_dict(part, value, f"{where}.{name}") if is_part else value  # type: ignore[arg-type]
+    return kind(**values)

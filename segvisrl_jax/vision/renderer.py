@@ -2,8 +2,10 @@
 
 from typing import Protocol
 
-from jaxtyping import Array, UInt8
+import numpy as np
+from jaxtyping import Array, Int, UInt8
 
+from segvisrl_jax.config import EnvConfig
 from segvisrl_jax.types import CameraPose, Scene
 
 
@@ -23,3 +25,22 @@ class Renderer(Protocol):
     def rgb(self, scene: Scene, camera: CameraPose) -> UInt8[Array, "rows columns 3"]:
         """Colour at every wanted row and column."""
         ...
+
+
+def make_renderer(
+    config: EnvConfig, rows: Int[np.ndarray, "rows"], columns: Int[np.ndarray, "columns"]
+) -> Renderer:
+    """The renderer that ``config.renderer`` names, for these rows and columns of the source image.
+
+    ``auto`` takes ``scanline``, which needs no OpenGL.
+
+    Raises:
+        ConfigError: where it cannot run here; the message says what to install or to use instead.
+    """
+    if config.renderer == "gl":
+        from segvisrl_jax.vision.gl import GlRenderer
+
+        return GlRenderer(config, rows, columns)
+    from segvisrl_jax.vision.scanline import ScanlineRenderer
+
+    return ScanlineRenderer(config, rows, columns)

@@ -1,0 +1,79 @@
+# Everything a user or a developer does, in one place. Each target sets the project up first, once.
+# make train ARCH=cnn_lstm PRESET=auto STEPS=... SEED=0 RUN=name ARGS="--env.scene.num-rocks 8"
+
+PYTHON ?= python3
+VENV ?= .venv
+ARCH ?= cnn_lstm
+PRESET ?= auto
+SEED ?= 0
+STEPS ?=
+RUN ?=
+ARGS ?=
+EPISODES ?= 1000
+
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+export JAX_PLATFORMS ?=
+ifeq ($(JAX_PLATFORMS),)
+unexport JAX_PLATFORMS
+endif
+
+.DEFAULT_GOAL := help
+.PHONY: help setup train eval baselines demo sweep bench test test-fast check format lock clean
+
+help: ## this list
+	@echo "usage: make TARGET [ARCH=cnn_lstm|cnn|cnn_lstm_raw|mlp] [PRESET=auto|cpu|gpu|paper|smoke] [STEPS=] [SEED=] [RUN=] [ARGS=]"
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  \1\t\2/' | expand -t 14
+
+setup: $(READY) ## create .venv from the pinned lock (every other target does it by itself)
+
+$(READY): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "segvisrl_jax needs Python 3.11 or newer; set PYTHON=/path/to/python3.11"; exit 2; }
+	@echo "Setting up $(VENV) from requirements.lock (once)"
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+train: $(READY) ## train ARCH with PRESET, evaluate it, write runs/<name>/
+	@$(BIN)/segvisrl train --arch $(ARCH) --preset $(PRESET) --seed $(SEED) $(if $(STEPS),--steps $(STEPS)) $(if $(RUN),--run $(RUN)) $(ARGS)
+
+eval: $(READY) ## drive EPISODES held-out scenes with runs/RUN, or POLICY=name
+	@$(BIN)/segvisrl eval $(if $(POLICY),--policy $(POLICY),--run $(if $(wildcard $(RUN)),$(RUN),runs/$(RUN))) --episodes $(EPISODES) --seed $(SEED) $(ARGS)
+
+baselines: $(READY) ## the P controller and the random one on 10,000 scenes
+	@$(BIN)/segvisrl eval --controller p --episodes 10000 --seed $(SEED) $(ARGS)
+	@$(BIN)/segvisrl eval --controller random --episodes 10000 --seed $(SEED) $(ARGS)
+
+demo: $(READY) ## a trained policy drives one scene: demo.mp4
+	@$(BIN)/segvisrl demo $(ARGS)
+
+sweep: $(READY) ## train over scales, architectures and seeds: a table and a plot
+	@$(BIN)/segvisrl sweep $(ARGS)
+
+bench: $(READY) ## measure physics, rendering and learning on this machine
+	@$(BIN)/segvisrl bench $(ARGS)
+
+test: $(READY) ## the whole suite, on the CPU
+	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest $(ARGS)
+
+test-fast: $(READY) ## the edit loop: everything but the slow tests
+	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -m "not slow" $(ARGS)
+
+check: $(READY) ## format, lint, types, fast tests
+	@$(BIN)/ruff format --check .
+	@$(BIN)/ruff check .
+	@$(BIN)/mypy
+	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -q -m "not slow"
+
+format: $(READY) ## rewrite the code in the project's format
+	@$(BIN)/ruff format .
+	@$(BIN)/ruff check --fix .
+
+lock: $(READY) ## resolve pyproject.toml anew into requirements.lock (needs uv on the path)
+	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --extra dev --upgrade \
+	  --no-emit-index-url --no-emit-find-links --no-annotate --no-header pyproject.toml -o requirements.lock
+
+clean: ## remove the environment and caches; runs stay
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist *.egg-info

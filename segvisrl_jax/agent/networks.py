@@ -1,0 +1,282 @@
+"""The policy and value network: Impala CNN or MLP, resettable LSTM, and the two heads.
+
+Architectures are ``config.Arch``. The CNN always runs on the flattened T * B images; only the LSTM
+runs over time.
+Networks know nothing of sampling (distributions.py) nor of learning (ppo.py).
+"""
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float32, PRNGKeyArray, Shaped, UInt8, UInt32
+
+from segvisrl_jax.config import Arch, NetworkConfig, require
+
+Params = Any  # flax's nested dict of parameters
+Key = PRNGKeyArray | UInt32[Array, "2"]
+Carry = tuple[Float32[Array, "..."], ...]
+"""The LSTM's (cell, hidden) state, each (*B, lstm_size); empty for a network without memory."""
+
+ACTION_SIZE = 2  # left and right wheel
+MIDDLE_SPEED = 0.5  # the policy starts at half speed, in the middle of the action's range [0, 1]
+HALF_RANGE = 0.5  # half the width of that range
+PIXEL_MAX = 255.0
+POOL_WINDOW, POOL_STRIDE = 3, 2  # Impala's max-pool (Espeholt et al., 2018)
+# Gains of the orthogonal initialisers: those usual for PPO. Inside residual blocks sqrt(2) would
+# multiply the features tenfold (root mean square 21 against 1.9) and saturate the LSTM's gates.
+HIDDEN_GAIN, RESIDUAL_GAIN, POLICY_GAIN, VALUE_GAIN = math.sqrt(2.0), 0.7, 0.01, 1.0
+MIN_STD, MAX_STD = 0.01, 10.0  # of the action; beyond, log-probabilities explode or all is clipped
+
+
+@struct.dataclass
+class PolicyOutput:
+    """What the network says about a batch of observations."""
+
+    mean: Float32[Array, "*B 2"]  # of the action, as a share of the top speed
+    log_std: Float32[Array, "2"]  # of the action, the same in every state
+    value: Float32[Array, "*B"]
+
+
+def has_memory(arch: Arch) -> bool:
+    """Whether the architecture carries an LSTM."""
+    return arch.startswith("cnn_lstm")
+
+
+def max_pool(images: Float32[Array, "N H W C"]) -> Float32[Array, "N H2 W2 C"]:
+    """3 x 3 max-pool with stride 2 and SAME padding, as elementwise maxima of strided slices.
+
+    Equal to ``flax.linen.max_pool``; its gradient is faster on a CPU, and shared where pixels tie.
+    """
+    return _pool_axis(_pool_axis(images, axis=2), axis=1)
+
+
+def _pool_axis(images: Float32[Array, "N H W C"], axis: int) -> Float32[Array, "N H2 W2 C"]:
+    size = images.shape[axis]
+    last = POOL_STRIDE * ((size - 1) // POOL_STRIDE)  # where the last window starts
+    padding = max(last + POOL_WINDOW - size, 0)
+    widths = [(0, 0)] * images.ndim
+    widths[axis] = (padding // 2, padding - padding // 2)
+    padded = jnp.pad(images, widths, constant_values=-jnp.inf)
+    shifts = range(POOL_WINDOW)
+    slices = [jax.lax.slice_in_dim(padded, k, k + last + 1, POOL_STRIDE, axis) for k in shifts]
+    return jnp.maximum(jnp.maximum(slices[0], slices[1]), slices[2])
+
+
+class ResidualBlock(nn.Module):
+    """relu, convolution, relu, convolution, added to the input."""
+
+    channels: int
+
+    @nn.compact
+    def __call__(self, images: Float32[Array, "N H W C"]) -> Float32[Array, "N H W C"]:
+        """Same shape out as in."""
+        change = _convolution(self.channels, RESIDUAL_GAIN)(nn.relu(images))
+        return images + _convolution(self.channels, RESIDUAL_GAIN)(nn.relu(change))
+
+
+class ImpalaCNN(nn.Module):
+    """Image to feature vector (Espeholt et al., 2018, the large network)."""
+
+    channels: tuple[int, ...]
+    blocks_per_stage: int
+    feature_size: int
+
+    @nn.compact
+    def __call__(self, images: UInt8[Array, "*B H W C"]) -> Float32[Array, "*B F"]:
+        """Features of every image; the leading axes are flattened for the convolutions."""
+        batch_shape = images.shape[:-3]
+        features = images.reshape((-1, *images.shape[-3:])).astype(jnp.float32) / PIXEL_MAX
+        for channels in self.channels:
+            features = max_pool(_convolution(channels)(features))
+            for _ in range(self.blocks_per_stage):
+                features = ResidualBlock(channels)(features)
+        features = nn.relu(features).reshape((features.shape[0], -1))
+        features = nn.relu(_dense(self.feature_size)(features))
+        return features.reshape((*batch_shape, self.feature_size))
+
+
+class MLP(nn.Module):
+    """Dense layers with relu over a state vector."""
+
+    sizes: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, vector: Float32[Array, "*B D"]) -> Float32[Array, "*B F"]:
+        """Features of every vector."""
+        for size in self.sizes:
+            vector = nn.relu(_dense(size)(vector))
+        return vector
+
+
+class ResettableLSTM(nn.Module):
+    """An LSTM whose carry is zeroed where an episode begins, before the cell sees it."""
+
+    size: int
+
+    def setup(self) -> None:
+        """Builds the cell (flax's own)."""
+        self.cell = nn.OptimizedLSTMCell(self.size, kernel_init=nn.initializers.orthogonal())
+
+    def __call__(
+        self, carry: Carry, features: Float32[Array, "B F"], reset: Float32[Array, " B"]
+    ) -> tuple[Carry, Float32[Array, "B S"]]:
+        """One step for every environment."""
+        begins = reset[:, None] > 0
+        cell, hidden = jax.tree.map(lambda part: jnp.where(begins, 0.0, part), carry)
+        return self.cell((cell, hidden), features)
+
+    def unroll(
+        self, carry: Carry, features: Float32[Array, "T B F"], reset: Float32[Array, "T B"]
+    ) -> tuple[Carry, Float32[Array, "T B S"]]:
+        """All steps in time order."""
+        scan = nn.scan(_lstm_step, variable_broadcast="params", split_rngs={"params": False})
+        return scan(self, carry, (features, reset))
+
+
+def _lstm_step(lstm: ResettableLSTM, carry: Carry, inputs: tuple) -> tuple[Carry, Array]:
+    features, reset = inputs
+    return lstm(carry, features, reset)
+
+
+class ActorCritic(nn.Module):
+    """Policy and value over a common body (paper, section III-D)."""
+
+    arch: Arch
+    config: NetworkConfig
+
+    def setup(self) -> None:
+        """Builds the body, the memory where the architecture has one, and the heads."""
+        config = self.config
+        self.body = _make_body(self.arch, config)
+        if has_memory(self.arch):
+            self.memory = ResettableLSTM(config.lstm_size)
+        self.policy_head = _dense(ACTION_SIZE, POLICY_GAIN)
+        self.value_head = _dense(1, VALUE_GAIN)
+        start = nn.initializers.constant(math.log(config.initial_std))
+        self.log_std = self.param("log_std", start, (ACTION_SIZE,))
+
+    def step(
+        self, carry: Carry, observation: Shaped[Array, "B ..."], reset: Float32[Array, " B"]
+    ) -> tuple[Carry, PolicyOutput]:
+        """One decision of B environments; an episode begins where ``reset`` is 1."""
+        features = self.body(observation)
+        if has_memory(self.arch):
+            carry, features = self.memory(carry, features, reset)
+        return carry, self._heads(features)
+
+    def unroll(
+        self, carry: Carry, observation: Shaped[Array, "T B ..."], reset: Float32[Array, "T B"]
+    ) -> tuple[Carry, PolicyOutput]:
+        """T decisions of B environments, from the carry before the first one."""
+        features = self.body(observation)
+        if has_memory(self.arch):
+            carry, features = self.memory.unroll(carry, features, reset)
+        return carry, self._heads(features)
+
+    def initial_carry(self, batch_shape: tuple[int, ...]) -> Carry:
+        """The carry at the start of an episode: zeros, or nothing where there is no memory."""
+        if not has_memory(self.arch):
+            return ()
+        zeros = jnp.zeros((*batch_shape, self.config.lstm_size), jnp.float32)
+        return (zeros, zeros)
+
+    def _heads(self, features: Float32[Array, "*B F"]) -> PolicyOutput:
+        free_mean = self.policy_head(features)
+        if self.config.bounded_mean:
+            mean = MIDDLE_SPEED + HALF_RANGE * jnp.tanh(free_mean)
+        else:
+            mean = MIDDLE_SPEED + free_mean
+        log_std = jnp.clip(self.log_std, math.log(MIN_STD), math.log(MAX_STD))
+        return PolicyOutput(mean, log_std, self.value_head(features)[..., 0])
+
+
+@dataclass(frozen=True)
+class Network:
+    """A network as pure functions of its parameters. Hashable: it may be static in ``jax.jit``."""
+
+    module: ActorCritic
+    observation_shape: tuple[int, ...]
+
+    def init(self, key: Key) -> Params:
+        """Fresh parameters."""
+        return self._compiled_init(key)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def _compiled_init(self, key: Key) -> Params:
+        observation = jnp.zeros((1, *self.observation_shape), self.observation_dtype)
+        carry = self.initial_carry((1,))
+        return self.module.init(key, carry, observation, jnp.ones((1,)), method="step")
+
+    def step(
+        self,
+        params: Params,
+        carry: Carry,
+        observation: Shaped[Array, "B ..."],
+        reset: Float32[Array, " B"],
+    ) -> tuple[Carry, PolicyOutput]:
+        """``ActorCritic.step``."""
+        return self.module.apply(params, carry, observation, reset, method="step")  # type: ignore[return-value]
+
+    def unroll(
+        self,
+        params: Params,
+        carry: Carry,
+        observation: Shaped[Array, "T B ..."],
+        reset: Float32[Array, "T B"],
+    ) -> tuple[Carry, PolicyOutput]:
+        """``ActorCritic.unroll``."""
+        return self.module.apply(params, carry, observation, reset, method="unroll")  # type: ignore[return-value]
+
+    def initial_carry(self, batch_shape: tuple[int, ...]) -> Carry:
+        """``ActorCritic.initial_carry``."""
+        return self.module.initial_carry(batch_shape)
+
+    @property
+    def has_memory(self) -> bool:
+        """Whether the network carries an LSTM."""
+        return has_memory(self.module.arch)
+
+    @property
+    def has_convolutions(self) -> bool:
+        """Whether the network looks at images."""
+        return self.module.arch != "mlp"
+
+    @property
+    def observation_dtype(self) -> Any:
+        """uint8 for images, float32 for state vectors."""
+        return jnp.uint8 if self.has_convolutions else jnp.float32
+
+
+def make_network(arch: Arch, config: NetworkConfig, observation_shape: tuple[int, ...]) -> Network:
+    """The network of an architecture for observations of one shape, without batch axes.
+
+    Raises:
+        ConfigError: for an unknown architecture, or a shape that it cannot read.
+    """
+    archs = Arch.__args__  # type: ignore[attr-defined]
+    require(arch in archs, "arch", arch, "one of " + ", ".join(archs))
+    rank, axes = (1, "(size,)") if arch == "mlp" else (3, "(rows, columns, channels)")
+    good = len(observation_shape) == rank and all(size >= 1 for size in observation_shape)
+    require(good, "observation_shape", observation_shape, f"{axes} for arch {arch!r}")
+    return Network(ActorCritic(arch, config), tuple(observation_shape))
+
+
+def _make_body(arch: Arch, config: NetworkConfig) -> MLP | ImpalaCNN:
+    if arch == "mlp":
+        return MLP(config.mlp_sizes)
+    return ImpalaCNN(config.channels, config.blocks_per_stage, config.feature_size)
+
+
+def _dense(size: int, gain: float = HIDDEN_GAIN) -> nn.Dense:
+    return nn.Dense(size, kernel_init=nn.initializers.orthogonal(gain))
+
+
+def _convolution(channels: int, gain: float = HIDDEN_GAIN) -> nn.Conv:
+    window = (3, 3)  # Impala's
+    return nn.Conv(channels, window, kernel_init=nn.initializers.orthogonal(gain))

@@ -1,0 +1,318 @@
+"""Proximal policy optimisation (Schulman et al., 2017) of a recurrent policy: epochs and steps.
+
+One ``Learner``, two ways to run it, one result. ``fused``: the whole update is one compiled
+program, for accelerators. ``host``: Python drives the minibatches, since XLA on a CPU runs
+convolution gradients inside a loop many times slower than outside it. The loss is in loss.py;
+acting is not here (training/rollout.py).
+"""
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import struct
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float32, Int32
+
+from segvisrl_jax.agent.loss import (
+    Batch,
+    LossTerms,
+    Trajectory,
+    make_batch,
+    ppo_loss,
+    take_environments,
+)
+from segvisrl_jax.agent.networks import Key, Network, Params
+from segvisrl_jax.config import PPOConfig, require
+
+Execution = Literal["auto", "host", "fused"]
+Metrics = dict[str, Float32[Array, ""]]
+Total = tuple[Params, LossTerms]  # sums of gradient and loss terms over chunks
+
+ADAM_EPSILON = 1e-5  # usual for PPO (Huang et al., 2022, "The 37 implementation details")
+# A gradient is summed over chunks of whole environments of at most this many pixels (at least one
+# environment). CPU: 64 images of 48 x 27, which measured fastest (cache). Accelerators: about 8 GB
+# of activations, at some 500 bytes a pixel.
+CPU_CHUNK_PIXELS, ACCELERATOR_CHUNK_PIXELS = 64 * 48 * 27, 16 * 2**20
+
+
+@struct.dataclass
+class LearnerState:
+    """All that learning changes."""
+
+    params: Params
+    opt_state: optax.OptState
+    num_updates: Int32[Array, ""]
+    num_gradient_steps: Int32[Array, ""]  # applied, not skipped
+
+
+@struct.dataclass
+class Progress:
+    """Where an update stands after some of its gradient steps."""
+
+    state: LearnerState
+    terms_sum: LossTerms  # over the applied steps
+    gradient_norm_sum: Float32[Array, ""]
+    last_kl: Float32[Array, ""]  # of the last applied step
+    num_applied: Int32[Array, ""]
+    num_skipped: Int32[Array, ""]
+    num_epochs_done: Int32[Array, ""]
+
+
+def learning_rate_schedule(config: PPOConfig, total_updates: int) -> optax.Schedule:
+    """Linear over the gradient steps of ``total_updates`` full updates."""
+    num_steps = total_updates * config.num_epochs * config.num_minibatches
+    final = config.learning_rate * config.final_learning_rate_share
+    return optax.linear_schedule(config.learning_rate, final, num_steps)
+
+
+def default_chunk(network: Network, config: PPOConfig, on_cpu: bool) -> int:
+    """Environments in one piece of a gradient: a divisor of those in a minibatch."""
+    per_minibatch = config.num_envs // config.num_minibatches
+    if not network.has_convolutions:
+        return per_minibatch
+    pixels = CPU_CHUNK_PIXELS if on_cpu else ACCELERATOR_CHUNK_PIXELS
+    rows, columns, _ = network.observation_shape
+    most = max(1, pixels // (rows * columns * config.unroll_length))
+    return max(n for n in range(1, per_minibatch + 1) if per_minibatch % n == 0 and n <= most)
+
+
+@dataclass(frozen=True)
+class Learner:
+    """Turns trajectories into better parameters. Build it with ``make_learner``.
+
+    The same state, trajectory and key give the same result, bit by bit on a CPU.
+    """
+
+    network: Network
+    config: PPOConfig
+    schedule: optax.Schedule
+    optimizer: optax.GradientTransformation
+    execution: Literal["host", "fused"]
+    chunk: int
+
+    def init(self, key: Key) -> LearnerState:
+        """Fresh parameters and optimiser state."""
+        params = self.network.init(key)
+        opt_state = self.optimizer.init(params)
+        return LearnerState(params, opt_state, _zero(jnp.int32), _zero(jnp.int32))
+
+    def update(
+        self,
+        state: LearnerState,
+        trajectory: Trajectory,
+        last_value: Float32[Array, " B"],
+        key: Key,
+    ) -> tuple[LearnerState, Metrics]:
+        """All epochs over one trajectory.
+
+        Epochs end early once the approximate KL divergence of an epoch's last minibatch is above
+        ``kl_stop``. A step whose loss or gradient is not finite is skipped and counted.
+
+        Args:
+            state: where learning stands; not changed.
+            trajectory: (T, B) = (unroll_length, num_envs) decisions.
+            last_value: value of the observation after the last decision.
+            key: for cutting the minibatches.
+
+        Returns:
+            The new state, and metrics as scalars: means over the applied gradient steps;
+            ``approx_kl`` of the last one; ``explained_variance`` before the update.
+
+        Raises:
+            ValueError: for a trajectory of another size.
+        """
+        expected = (self.config.unroll_length, self.config.num_envs)
+        if trajectory.reward.shape != expected:
+            raise ValueError(f"trajectory is {trajectory.reward.shape}, the config says {expected}")
+        if self.execution == "fused":
+            return self._fused_update(state, trajectory, last_value, key)
+        return self._host_update(state, trajectory, last_value, key)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def _fused_update(
+        self, state: LearnerState, trajectory: Trajectory, last_value: Array, key: Key
+    ) -> tuple[LearnerState, Metrics]:
+        batch, minibatches, explained_variance = self._prepare(trajectory, last_value, key)
+
+        def run_epoch(progress: Progress) -> Progress:
+            step = functools.partial(self._minibatch_step, batch)
+            progress, _ = jax.lax.scan(step, progress, minibatches[progress.num_epochs_done])
+            return _end_epoch(progress)
+
+        progress = jax.lax.while_loop(self._goes_on, run_epoch, _start_progress(state))
+        return self._finish(progress, explained_variance)
+
+    def _host_update(
+        self, state: LearnerState, trajectory: Trajectory, last_value: Array, key: Key
+    ) -> tuple[LearnerState, Metrics]:
+        batch, minibatches, explained_variance = self._prepare(trajectory, last_value, key)
+        progress, zero = _start_progress(state), _zero_total(state.params)
+        for epoch in np.asarray(minibatches):
+            for envs in epoch:
+                total = zero
+                for piece in envs.reshape(-1, self.chunk):
+                    total = self._add_chunk(total, progress.state.params, batch, piece)
+                progress = self._apply(progress, total)
+            progress = _end_epoch(progress)
+            if self.config.kl_stop > 0 and not self._goes_on(progress):
+                break
+        return self._finish(progress, explained_variance)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def _prepare(
+        self, trajectory: Trajectory, last_value: Array, key: Key
+    ) -> tuple[Batch, Int32[Array, "E M N"], Float32[Array, ""]]:
+        """The batch, the environments of each minibatch of each epoch, the explained variance."""
+        batch, explained_variance = make_batch(trajectory, last_value, self.config)
+        num_envs, num_epochs = self.config.num_envs, self.config.num_epochs
+        keys = jax.random.split(key, num_epochs)
+        order = jax.vmap(lambda epoch_key: jax.random.permutation(epoch_key, num_envs))(keys)
+        minibatches = order.reshape((num_epochs, self.config.num_minibatches, -1))
+        return batch, minibatches.astype(jnp.int32), explained_variance
+
+    def _minibatch_step(
+        self, batch: Batch, progress: Progress, envs: Int32[Array, " N"]
+    ) -> tuple[Progress, None]:
+        params = progress.state.params
+
+        def add(total: Total, piece: Int32[Array, " chunk"]) -> tuple[Total, None]:
+            return self._add_chunk(total, params, batch, piece), None
+
+        pieces = envs.reshape((-1, self.chunk))
+        total, _ = jax.lax.scan(add, _zero_total(params), pieces, unroll=len(pieces) == 1)
+        return self._apply(progress, total), None
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def _add_chunk(
+        self, total: Total, params: Params, batch: Batch, envs: Int32[Array, " chunk"]
+    ) -> Total:
+        """Adds the gradient and the loss terms of a few environments."""
+        gradient_of = jax.value_and_grad(ppo_loss, has_aux=True)
+        part = take_environments(batch, envs)
+        (_, terms), gradient = gradient_of(params, part, self.network, self.config)
+        return jax.tree.map(jnp.add, total, (gradient, terms))
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def _apply(self, progress: Progress, total: Total) -> Progress:
+        """One step of the optimiser with the mean over a minibatch's chunks, if it is finite."""
+        num_chunks = self.config.num_envs // self.config.num_minibatches // self.chunk
+        gradient, terms = jax.tree.map(lambda leaf: leaf / num_chunks, total)
+        state = progress.state
+        norm = optax.global_norm(gradient)
+        updates, opt_state = self.optimizer.update(gradient, state.opt_state, state.params)
+        stepped = Progress(
+            state=dataclasses.replace(
+                state,
+                params=optax.apply_updates(state.params, updates),
+                opt_state=opt_state,
+                num_gradient_steps=state.num_gradient_steps + 1,
+            ),
+            terms_sum=jax.tree.map(jnp.add, progress.terms_sum, terms),
+            gradient_norm_sum=progress.gradient_norm_sum + norm,
+            last_kl=terms.approx_kl,
+            num_applied=progress.num_applied + 1,
+            num_skipped=progress.num_skipped,
+            num_epochs_done=progress.num_epochs_done,
+        )
+        skipped = dataclasses.replace(progress, num_skipped=progress.num_skipped + 1)
+        finite = jnp.isfinite(norm) & jnp.isfinite(terms.loss)
+        return jax.tree.map(functools.partial(jnp.where, finite), stepped, skipped)
+
+    def _goes_on(self, progress: Progress) -> Array:
+        """Whether another epoch follows."""
+        more = progress.num_epochs_done < self.config.num_epochs
+        if self.config.kl_stop == 0:
+            return more
+        return more & (progress.last_kl <= self.config.kl_stop)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def _finish(
+        self, progress: Progress, explained_variance: Float32[Array, ""]
+    ) -> tuple[LearnerState, Metrics]:
+        state = dataclasses.replace(progress.state, num_updates=progress.state.num_updates + 1)
+        count = jnp.maximum(progress.num_applied, 1).astype(jnp.float32)
+        means = jax.tree.map(lambda leaf: leaf / count, progress.terms_sum)
+        metrics = {field.name: getattr(means, field.name) for field in dataclasses.fields(means)}
+        metrics |= {
+            "approx_kl": progress.last_kl,
+            "explained_variance": explained_variance,
+            "gradient_norm": progress.gradient_norm_sum / count,
+            "learning_rate": jnp.asarray(self.schedule(state.num_gradient_steps), jnp.float32),
+            "num_epochs_done": progress.num_epochs_done.astype(jnp.float32),
+            "skipped_steps": progress.num_skipped.astype(jnp.float32),
+        }
+        return state, metrics
+
+
+def make_learner(
+    network: Network,
+    config: PPOConfig,
+    total_updates: int,
+    execution: Execution = "auto",
+    chunk: int | None = None,
+) -> Learner:
+    """The learner of a network.
+
+    Args:
+        network: from ``make_network``.
+        config: settings of PPO.
+        total_updates: updates of the whole run, over which the learning rate falls.
+        execution: host or fused (see the module); auto takes host for convolutions on a CPU.
+        chunk: environments in one piece of a minibatch's gradient; ``default_chunk`` where None.
+            It changes speed and memory, and the result by rounding only.
+
+    Raises:
+        ConfigError: for settings out of range.
+    """
+    options = Execution.__args__  # type: ignore[attr-defined]
+    require(execution in options, "execution", execution, "one of " + ", ".join(options))
+    require(total_updates >= 1, "total_updates", total_updates, "at least 1")
+    per_minibatch = config.num_envs // config.num_minibatches
+    on_cpu = jax.default_backend() == "cpu"
+    if chunk is None:
+        chunk = default_chunk(network, config, on_cpu)
+    divides = 1 <= chunk <= per_minibatch and per_minibatch % chunk == 0
+    should = f"a divisor of the {per_minibatch} environments in a minibatch"
+    require(divides, "chunk", chunk, should)
+    if execution == "auto":
+        execution = "host" if on_cpu and network.has_convolutions else "fused"
+    schedule = learning_rate_schedule(config, total_updates)
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(config.max_gradient_norm),
+        optax.adam(schedule, eps=ADAM_EPSILON),
+    )
+    return Learner(network, config, schedule, optimizer, execution, chunk)
+
+
+def _start_progress(state: LearnerState) -> Progress:
+    return Progress(
+        state=state,
+        terms_sum=_zero_terms(),
+        gradient_norm_sum=_zero(),
+        last_kl=_zero(),
+        num_applied=_zero(jnp.int32),
+        num_skipped=_zero(jnp.int32),
+        num_epochs_done=_zero(jnp.int32),
+    )
+
+
+def _end_epoch(progress: Progress) -> Progress:
+    return dataclasses.replace(progress, num_epochs_done=progress.num_epochs_done + 1)
+
+
+def _zero_total(params: Params) -> Total:
+    return jax.tree.map(jnp.zeros_like, params), _zero_terms()
+
+
+def _zero_terms() -> LossTerms:
+    return LossTerms(**{field.name: _zero() for field in dataclasses.fields(LossTerms)})
+
+
+def _zero(dtype: DTypeLike = jnp.float32) -> Array:
+    return jnp.zeros((), dtype)

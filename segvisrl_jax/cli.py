@@ -1,0 +1,102 @@
+"""``segvisrl COMMAND ...``: finds the command, parses its options, turns a user's mistake into one line.
+
+Every option comes from a dataclass (tyro). Nothing heavy is imported before it is needed.
+"""
+
+import contextlib
+import importlib
+import io
+import re
+import sys
+from collections.abc import Sequence
+from typing import TypeVar
+
+from segvisrl_jax.config import ConfigError
+
+COMMANDS = {
+    "train": "train a policy, evaluate it, draw its learning curve and a video",
+    "eval": "drive held-out scenes with a run, a policy or a controller, and report shares with intervals",
+    "demo": "let a policy drive one scene and write a video",
+    "sweep": "train over scales, architectures and seeds; a table and a plot",
+    "bench": "measure physics, rendering and learning on this machine",
+}
+USAGE_ERROR = 2
+INTERRUPTED = 130
+OptionsT = TypeVar("OptionsT")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The program. Returns its exit code: 0, 1 for a failure, 2 for a mistake in what was asked, 130 after Ctrl-C."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    if not words or words[0] in ("-h", "--help"):
+        print(_usage())
+        return 0 if words else USAGE_ERROR
+    command, options = words[0], words[1:]
+    if command == "--version":
+        from importlib.metadata import version
+
+        print(version("segvisrl_jax"))
+        return 0
+    if command not in COMMANDS:
+        print(f"segvisrl: {command!r} is not a command; there are: {', '.join(COMMANDS)}", file=sys.stderr)
+        return USAGE_ERROR
+    try:
+        module = importlib.import_module(f"segvisrl_jax.commands.{command}")
+        return module.run(options)
+    except ConfigError as error:
+        print(f"segvisrl {command}: {error}", file=sys.stderr)
+        return USAGE_ERROR
+    except KeyboardInterrupt:
+        print(f"\nsegvisrl {command}: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: OptionsT | None = None) -> OptionsT:
+    """Options from the words of a command line.
+
+    Raises:
+        ConfigError: for an option that does not exist or a value that does not fit, in one line.
+        SystemExit: after ``--help``.
+    """
+    import tyro
+
+    said = io.StringIO()
+    words = [_whole_number(word) for word in options]
+    settings = {} if default is None else {"default": default}
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(kind, args=words, prog=f"segvisrl {command}", **settings)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        raise ConfigError(_one_line(said.getvalue())) from None
+
+
+def _whole_number(word: str) -> str:
+    """``5e6`` as ``5000000``: large counts are written that way."""
+    if re.fullmatch(r"\d+(\.\d+)?[eE]\+?\d{1,2}", word) and float(word).is_integer():
+        return str(int(float(word)))
+    return word
+
+
+def _one_line(message: str) -> str:
+    """tyro's framed error without its frame: the first paragraph under the title, in one line."""
+    lines = [line.strip(" │╭╮╰╯─-") for line in message.splitlines()]
+    paragraph: list[str] = []
+    for line in lines[1:]:
+        if line.startswith(("For full helptext", "Argument helptext", "Perhaps you meant")):
+            break
+        if line:
+            paragraph.append(line)
+    text = " ".join(paragraph)
+    return re.sub(r"^Error parsing (env|ppo|network|evaluation)[\w.]*: ", "", text)
+
+
+def _usage() -> str:
+    width = max(map(len, COMMANDS))
+    rows = "\n".join(f"  {name:<{width}}  {what}" for name, what in COMMANDS.items())
+    return f"usage: segvisrl COMMAND [OPTIONS]\n\n{rows}\n\nsegvisrl COMMAND --help lists a command's options."
+
+
+if __name__ == "__main__":
+    sys.exit(main())

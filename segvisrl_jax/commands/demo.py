@@ -1,0 +1,63 @@
+"""``segvisrl demo``: a policy drives one scene, and a video shows what it saw and where it went."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from segvisrl_jax.cli import parse
+from segvisrl_jax.config import ConfigError, require
+
+DEFAULT_POLICY = "cnn_lstm"
+VIDEO_SUFFIXES = (".mp4", ".gif")
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """Lets a policy drive one scene and writes a video: camera, segmentation, what the policy sees, the map."""
+
+    run: Path | None = None
+    """A run's folder: its best policy drives."""
+    policy: str | None = None
+    """A policy's folder, or the name of a shipped one. Default: cnn_lstm."""
+    controller: Literal["p", "random"] | None = None
+    scene: int = 0
+    """Number of the scene."""
+    num_rocks: int | None = None
+    output: Path = Path("demo.mp4")
+    """Where to write the video, .mp4 or .gif."""
+
+    def __post_init__(self) -> None:
+        require(0 <= self.scene < 2**31, "--scene", self.scene, "in [0, 2^31)")
+        require(self.output.suffix in VIDEO_SUFFIXES, "--output", str(self.output), "a name that ends in .mp4 or .gif")
+
+
+def run(options: Sequence[str]) -> int:
+    """Parses, drives, writes."""
+    asked = parse(DemoOptions, options, "demo")
+    if not asked.output.resolve().parent.is_dir():
+        raise ConfigError(f"--output = {str(asked.output)!r}: should be in a folder that exists")
+    outcome = record(asked)
+    print(f"{outcome}: {asked.output}")
+    return 0
+
+
+def record(asked: DemoOptions) -> str:
+    """Drives the scene and writes the video. Returns how the episode ended."""
+    from segvisrl_jax.commands.eval import load_driver, with_overrides
+    from segvisrl_jax.env.rover_env import RoverEnv
+    from segvisrl_jax.env.wrappers import TEST_STREAM, scene_stream
+    from segvisrl_jax.report.episode import drive_episode, episode_frames
+    from segvisrl_jax.report.video import write_video
+
+    named = asked.run or asked.policy or asked.controller
+    policy_name = asked.policy if named else DEFAULT_POLICY
+    policy, params, config = load_driver(asked.run, policy_name, asked.controller)
+    env = RoverEnv(with_overrides(config, asked.num_rocks, None, None))
+    episode = drive_episode(env, policy, params, scene_stream(asked.scene, TEST_STREAM))
+    frames = episode_frames(env, episode, title=policy.name)
+    write_video(asked.output, frames, fps=FRAMES_PER_SECOND)
+    return episode.outcome.name.lower()
+
+
+FRAMES_PER_SECOND = 8  # eight decisions, so eight simulated seconds, in each second of video

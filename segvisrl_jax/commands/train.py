@@ -1,0 +1,122 @@
+"""``segvisrl train``: one training run and everything that it leaves behind."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from segvisrl_jax.cli import INTERRUPTED, parse
+from segvisrl_jax.config import ConfigError, TrainConfig, from_dict, preset_config, to_dict
+
+TEST_EPISODES = 200  # driven after training, on scenes that neither training nor the choice of the policy saw
+
+
+def run(options: Sequence[str]) -> int:
+    """Parses, trains, evaluates, draws."""
+    config = parse_config(options)
+
+    from segvisrl_jax.training.loop import train
+
+    if not config.resume:
+        print(differences_from_paper(config))
+    result = train(config)
+    resume = f"segvisrl train --resume --runs-dir {config.runs_dir} --run {config.run_name}"
+    if not result.finished:
+        print(f"Stopped and saved after {result.decisions:,} decisions. Go on with:\n  {resume}")
+        return INTERRUPTED
+    _finish(config, result.run_dir)
+    return 0
+
+
+def parse_config(options: Sequence[str]) -> TrainConfig:
+    """The resolved settings: preset, then options; a run that goes on starts from its own settings instead."""
+    words = [word for option in options for word in _split_equals(option)]
+    arch, preset = _value(words, "--arch", "cnn_lstm"), _value(words, "--preset", "auto")
+    if "--resume" in words:
+        base = _stored_config(_value(words, "--runs-dir", "runs"), _value(words, "--run", ""))
+        if base is not None:
+            return parse(TrainConfig, words, "train", base)
+    if preset == "auto":
+        preset = _preset_for_this_machine()
+        words = _without(words, "--preset")
+    return parse(TrainConfig, words, "train", preset_config(arch, preset))
+
+
+def _stored_config(runs_dir: str, run_name: str) -> TrainConfig | None:
+    file = Path(runs_dir) / run_name / "config.json"
+    if not run_name or not file.is_file():
+        return None
+    try:
+        return from_dict(TrainConfig, json.loads(file.read_text()))
+    except ValueError as error:
+        raise ConfigError(f"{file}: not a run's settings ({error})") from None
+
+
+def _preset_for_this_machine() -> str:
+    import jax
+
+    from segvisrl_jax.env.physics.native import make_callbacks_safe
+
+    make_callbacks_safe()  # before the next line starts JAX's backends
+    return "cpu" if jax.default_backend() == "cpu" else "gpu"
+
+
+def _split_equals(word: str) -> list[str]:
+    return word.split("=", 1) if word.startswith("--") and "=" in word else [word]
+
+
+def _value(words: Sequence[str], option: str, default: str) -> str:
+    """The word behind the last use of an option."""
+    found = [i for i, word in enumerate(words[:-1]) if word == option]
+    return words[found[-1] + 1] if found else default
+
+
+def _without(words: list[str], option: str) -> list[str]:
+    if option not in words:
+        return words
+    i = words.index(option)
+    return _without(words[:i] + words[i + 2 :], option)
+
+
+def differences_from_paper(config: TrainConfig) -> str:
+    """One block: what of these settings is not the paper's."""
+    paper = _flat(to_dict(preset_config(config.arch, "paper")))
+    ours = _flat(to_dict(config))
+    bookkeeping = ("seed", "run", "runs_dir", "resume", "preset", "checkpoint_every_updates")
+    rows = [
+        f"  {name:<34} {_short(value):>12}   paper {_short(paper[name])}"
+        for name, value in ours.items()
+        if value != paper[name] and name not in bookkeeping and not name.startswith("evaluation.")
+    ]
+    title = f"{config.arch}, preset {config.preset}, seed {config.seed}: "
+    if not rows:
+        return title + "the paper's settings."
+    return "\n".join([title + "differs from the paper's settings in", *rows])
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return flat
+
+
+def _short(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def _finish(config: TrainConfig, run_dir: Path) -> None:
+    """Test scenes, learning curve, video, and what to type next."""
+    from segvisrl_jax.commands import demo
+    from segvisrl_jax.commands.eval import EvalOptions, evaluate, report_line
+    from segvisrl_jax.report.figures import learning_curve
+
+    episodes = min(TEST_EPISODES, 25 * config.evaluation.episodes)
+    result = evaluate(EvalOptions(run=run_dir, episodes=episodes, seed=config.seed, slots=config.evaluation.num_slots))
+    (run_dir / "eval.json").write_text(json.dumps(result, indent=2) + "\n")
+    learning_curve([run_dir], run_dir / "learning_curve.png")
+    demo.record(demo.DemoOptions(run=run_dir, output=run_dir / "rollout.mp4"))
+    print(f"\n{episodes} test scenes: {report_line(result)}")
+    for name in ("config.json", "metrics.jsonl", "eval.json", "learning_curve.png", "rollout.mp4", "policy/"):
+        print(f"  {run_dir / name}")
+    print(f"Next: segvisrl eval --run {run_dir} --episodes 1000    or    segvisrl demo --run {run_dir} --scene 1")

@@ -1,0 +1,116 @@
+"""The physics in MuJoCo's C library, on a pool of threads that lives as long as the engine.
+
+One callback a decision moves the whole batch, however many ``vmap``s led to it. Works on any JAX backend that has JAX's
+cpu platform beside it; it is fast where the program itself runs on the CPU.
+"""
+
+import os
+import threading
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.rollout
+import numpy as np
+from jaxtyping import Array, Float, Float32
+
+from segvisrl_jax.config import ConfigError, EnvConfig
+from segvisrl_jax.env.model import build_physics_model
+from segvisrl_jax.env.physics import engine
+from segvisrl_jax.types import Action, PhysicsState
+
+
+def make_callbacks_safe() -> None:
+    """Makes JAX's CPU backend run programs in the calling thread.
+
+    Otherwise a program that waits for its callback can hold the very threads which the callback's arguments wait for, and
+    hang (jax issues 24219, 25861). JAX reads this once, when its first array or device is made: call it before that.
+    """
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+
+
+class NativeEngine:
+    """``PhysicsEngine`` through ``mujoco.rollout``. Equal states and actions give equal bits, whatever the batch."""
+
+    name = "native"
+
+    def __init__(self, config: EnvConfig):
+        """Builds the model and starts the threads.
+
+        Raises:
+            ConfigError: where JAX has no cpu platform, which callbacks need.
+        """
+        make_callbacks_safe()
+        _require_cpu_platform()
+        self._model = build_physics_model(config)
+        self._rest_height_m = engine.rest_height_m(self._model)
+        self._max_wheel_speed = float(self._model.actuator_ctrlrange[0, 1])
+        self._num_judgements = config.task.num_judgements
+        self._stride = engine.steps_per_judgement(config)
+        num_threads = config.physics.num_threads or os.cpu_count() or 1
+        self._rest = np.concatenate([self._model.qpos0, np.zeros(self._model.nv)])
+        self._data = [mujoco.MjData(self._model) for _ in range(num_threads)]
+        # With one thread there is no pool: the calling thread does the work.
+        self._pool = mujoco.rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
+        self._lock = (
+            threading.Lock()
+        )  # several devices may call at once; the threads' MjData are shared
+
+    def place(self, xy_m: Float32[Array, "2"], yaw_rad: Float32[Array, ""]) -> PhysicsState:
+        """See ``PhysicsEngine.place``."""
+        return engine.at_rest(xy_m, yaw_rad, self._rest_height_m)
+
+    def advance(self, state: PhysicsState, action: Action) -> PhysicsState:
+        """See ``PhysicsEngine.advance``."""
+        control = engine.wheel_command(action, self._max_wheel_speed)
+        shape = PhysicsState(
+            qpos=jax.ShapeDtypeStruct((self._num_judgements, 11), jnp.float32),
+            qvel=jax.ShapeDtypeStruct((self._num_judgements, 10), jnp.float32),
+        )
+        states = jax.pure_callback(
+            self._advance_batch, shape, state.qpos, state.qvel, control, vmap_method="broadcast_all"
+        )
+        return engine.keep_diverged(state, action, states)
+
+    def _advance_batch(self, qpos: Array, qvel: Array, control: Array) -> PhysicsState:
+        """The callback: any leading axes in, the same leading axes and J out. NumPy inside: JAX here could hang."""
+        qpos, qvel, control = np.asarray(qpos), np.asarray(qvel), np.asarray(control)
+        batch = qpos.shape[:-1]
+        start = np.concatenate([qpos, qvel], axis=-1).reshape(-1, 21)
+        states = self._roll_out(start, control.reshape(-1, 1, 4))
+        states = states.astype(np.float32).reshape(*batch, self._num_judgements, 21)
+        return PhysicsState(qpos=states[..., :11], qvel=states[..., 11:])
+
+    def _roll_out(
+        self, start: Float[np.ndarray, "B 21"], control: Float[np.ndarray, "B 1 4"]
+    ) -> Float[np.ndarray, "B J 21"]:
+        """Judged states of a flat batch; NaN where MuJoCo warned.
+
+        MuJoCo's full physics state is time, qpos, qvel; the solver starts cold (without ``initial_warmstart``). At a
+        warning ``rollout`` stops stepping that trajectory and repeats its state, which may be finite: its time gives it
+        away. What is not finite to begin with never reaches MuJoCo, which would write a warning to disk every time;
+        ``engine.keep_diverged`` answers for it.
+        """
+        finite = np.isfinite(start).all(axis=1) & np.isfinite(control).all(axis=(1, 2))
+        start = np.where(finite[:, None], start, self._rest)
+        control = np.where(finite[:, None, None], control, 0.0)
+        full = np.concatenate([np.zeros((len(start), 1)), start], axis=1)
+        num_steps = self._stride * self._num_judgements
+        with self._lock:
+            states, _ = self._pool.rollout(
+                self._model, self._data, full, control.astype(np.float64), nstep=num_steps
+            )
+        judged = states[:, self._stride - 1 :: self._stride]
+        steps_done = np.rint(judged[..., 0] / self._model.opt.timestep)
+        steps_due = self._stride * np.arange(1, self._num_judgements + 1)
+        return np.where((steps_done == steps_due)[..., None], judged[..., 1:], np.nan)
+
+
+def _require_cpu_platform() -> None:
+    try:
+        jax.devices("cpu")
+    except RuntimeError:
+        raise ConfigError(
+            "physics.engine = 'native': should be 'mjx' here, because callbacks need JAX's cpu platform beside the "
+            "accelerator (or set JAX_PLATFORMS to both, e.g. cuda,cpu)"
+        ) from None

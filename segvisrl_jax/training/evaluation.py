@@ -1,0 +1,192 @@
+"""The evaluation protocol: the same held-out scenes for every method, one number with its interval for each outcome.
+
+Episode i of a seed is always the same scene (``fold_in`` of the stream's key with i), however many episodes are
+driven at a time and whoever drives.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Int32, PRNGKeyArray
+
+from segvisrl_jax.env.rover_env import RoverEnv
+from segvisrl_jax.env.wrappers import select
+from segvisrl_jax.training.policy import Policy
+from segvisrl_jax.training.shortest_path import shortest_path_m
+from segvisrl_jax.training.statistics import path_ratio, spl, wilson_interval
+from segvisrl_jax.types import Outcome, RoverState
+
+DECISIONS_PER_CALL = 10  # of every slot between two looks of the host at what has finished
+
+
+@struct.dataclass
+class Slots:
+    """S episodes that are being driven."""
+
+    rover: RoverState
+    episode: Int32[Array, "S"]  # which episode each slot drives; beyond the last: idle
+    next_episode: Int32[Array, ""]
+    is_first: Array
+    carry: Any
+
+
+@struct.dataclass
+class Finished:
+    """Episodes that ended, as NumPy arrays in the order of their numbers."""
+
+    outcome: np.ndarray
+    num_decisions: np.ndarray
+    path_length_m: np.ndarray
+    min_clearance_m: np.ndarray
+    episode_return: np.ndarray
+    goal_xy_m: np.ndarray
+    rock_xy_m: np.ndarray
+
+
+@dataclasses.dataclass
+class Evaluator:
+    """Drives one policy over numbered scenes. Compiles once; ``run`` may be called for many parameters."""
+
+    env: RoverEnv
+    policy: Policy
+    num_slots: int
+
+    def __post_init__(self) -> None:
+        self._start = jax.jit(self._begin)
+        self._drive = jax.jit(self._drive_some)
+
+    def run(
+        self,
+        params: Any,
+        stream: PRNGKeyArray,
+        episodes: int,
+        on_progress: Callable[[int], None] = lambda done: None,
+    ) -> Finished:
+        """Drives episodes 0 to ``episodes`` - 1 of a scene stream, each to its end."""
+        number = jnp.int32(episodes)
+        slots = self._start(stream, number)
+        found: dict[int, dict[str, np.ndarray]] = {}
+        step = 0
+        while len(found) < episodes:
+            slots, ended = self._drive(params, slots, stream, number, jnp.int32(step))
+            _collect(jax.device_get(ended), found)
+            on_progress(len(found))
+            step += 1
+        rows = [found[i] for i in range(episodes)]
+        return Finished(**{name: np.stack([row[name] for row in rows]) for name in rows[0]})
+
+    def _begin(self, stream: PRNGKeyArray, episodes: Array) -> Slots:
+        episode = jnp.arange(self.num_slots, dtype=jnp.int32)
+        return Slots(
+            rover=self._scenes(stream, episode),
+            episode=episode,
+            next_episode=jnp.int32(self.num_slots),
+            is_first=jnp.ones(self.num_slots, jnp.float32),
+            carry=self.policy.initial_carry(self.num_slots),
+        )
+
+    def _scenes(self, stream: PRNGKeyArray, episode: Int32[Array, "S"]) -> RoverState:
+        return jax.vmap(lambda i: self.env.initial_state(jax.random.fold_in(stream, i)))(episode)
+
+    def _drive_some(self, params, slots, stream, episodes, step) -> tuple[Slots, dict[str, Array]]:
+        key = jax.random.fold_in(jax.random.fold_in(stream, episodes), step)
+        keys = jax.random.split(key, DECISIONS_PER_CALL)
+        decide = functools.partial(self._decide, params, stream, episodes)
+        return jax.lax.scan(decide, slots, keys)
+
+    def _decide(
+        self, params, stream, episodes, slots: Slots, key
+    ) -> tuple[Slots, dict[str, Array]]:
+        observation = jax.vmap(self.env.observe)(slots.rover) if self.policy.observes else None
+        carry, action = self.policy.act(
+            params, slots.carry, slots.rover, observation, slots.is_first, key
+        )
+        is_driving = slots.episode < episodes
+        driven, _ = jax.vmap(self.env.advance)(slots.rover, action)
+        rover = select(is_driving, driven, slots.rover)
+        done = is_driving & (rover.outcome != Outcome.RUNNING)
+        ended = _ended(slots.episode, done, rover)
+        after = slots.replace(rover=rover, carry=carry, is_first=jnp.zeros_like(slots.is_first))
+        refill = functools.partial(self._refill, stream)
+        return jax.lax.cond(jnp.any(done), refill, lambda _, s: s, done, after), ended
+
+    def _refill(self, stream: PRNGKeyArray, done: Bool[Array, "S"], slots: Slots) -> Slots:
+        """Slots whose episode ended take the next numbers."""
+        following = slots.next_episode + jnp.cumsum(done, dtype=jnp.int32) - 1
+        episode = jnp.where(done, following, slots.episode)
+        return slots.replace(
+            rover=select(done, self._scenes(stream, episode), slots.rover),
+            episode=episode,
+            next_episode=slots.next_episode + jnp.sum(done, dtype=jnp.int32),
+            is_first=done.astype(jnp.float32),
+        )
+
+
+def _ended(episode: Array, done: Array, rover: RoverState) -> dict[str, Array]:
+    return {
+        "episode": jnp.where(done, episode, -1),
+        "outcome": rover.outcome,
+        "num_decisions": rover.num_decisions,
+        "path_length_m": rover.path_length_m,
+        "min_clearance_m": rover.min_clearance_m,
+        "episode_return": rover.episode_return,
+        "goal_xy_m": rover.scene.goal_xy_m,
+        "rock_xy_m": rover.scene.rock_xy_m,
+    }
+
+
+def _collect(ended: dict[str, np.ndarray], found: dict[int, dict[str, np.ndarray]]) -> None:
+    """Files what ended in one call under its episode's number."""
+    episodes = ended.pop("episode")
+    for where in zip(*np.nonzero(episodes >= 0), strict=True):
+        found[int(episodes[where])] = {name: values[where] for name, values in ended.items()}
+
+
+def summarize(finished: Finished, env: RoverEnv) -> dict[str, Any]:
+    """Shares of the outcomes with their intervals, and the quality of the paths.
+
+    Returns:
+        success, collision, fall, timeout, unstable: shares that sum to 1; success_ci95 and the other outcomes'
+        intervals (Wilson); spl (Anderson et al. 2018, against the shortest collision-free path); path_ratio (driven over
+        shortest, successful episodes); mean_time_s of successful episodes; min_clearance_m, the least distance to a rock's
+        centre over all episodes (None without rocks); mean_return.
+    """
+    episodes = len(finished.outcome)
+    summary: dict[str, Any] = {"episodes": episodes}
+    for kind in Outcome:
+        if kind == Outcome.RUNNING:
+            continue
+        count = int(np.sum(finished.outcome == kind))
+        summary[kind.name.lower()] = count / episodes
+        if kind != Outcome.UNSTABLE:
+            summary[f"{kind.name.lower()}_ci95"] = list(wilson_interval(count, episodes))
+    succeeded = finished.outcome == Outcome.SUCCESS
+    shortest = shortest_paths_m(finished, env)
+    clearance = float(np.min(finished.min_clearance_m))
+    time_s = finished.num_decisions[succeeded] * env.dt
+    summary["spl"] = spl(succeeded, shortest, finished.path_length_m)
+    summary["path_ratio"] = path_ratio(succeeded, shortest, finished.path_length_m)
+    summary["mean_time_s"] = float(np.mean(time_s)) if succeeded.any() else None
+    summary["min_clearance_m"] = clearance if np.isfinite(clearance) else None
+    summary["mean_return"] = float(np.mean(finished.episode_return))
+    return summary
+
+
+def shortest_paths_m(finished: Finished, env: RoverEnv) -> np.ndarray:
+    """Length of the shortest collision-free path of every episode's scene, (episodes,)."""
+    scene, task = env.config.scene, env.config.task
+    pairs = zip(finished.goal_xy_m, finished.rock_xy_m, strict=True)
+    start = np.asarray(scene.start_xy_m)
+    half = scene.map_size_m / 2
+    return np.array(
+        [
+            shortest_path_m(start, goal, task.goal_radius_m, rocks, task.collision_radius_m, half)
+            for goal, rocks in pairs
+        ]
+    )

@@ -1,0 +1,270 @@
+"""``train(config)``: rollouts, updates, held-out evaluation, checkpoints, signals; what a run leaves behind."""
+
+import collections
+import dataclasses
+import json
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from flax import struct
+
+from segvisrl_jax.agent.networks import Network, make_network
+from segvisrl_jax.agent.ppo import Learner, LearnerState, make_learner
+from segvisrl_jax.config import ConfigError, EnvConfig, TrainConfig, replace_fields, to_dict
+from segvisrl_jax.env.rover_env import RoverEnv
+from segvisrl_jax.env.wrappers import VALIDATION_STREAM, BatchEnv, scene_stream
+from segvisrl_jax.training.checkpoint import Checkpoints, save_policy
+from segvisrl_jax.training.evaluation import Evaluator, summarize
+from segvisrl_jax.training.metrics import MetricsWriter, ProgressDisplay
+from segvisrl_jax.training.policy import Policy, network_policy
+from segvisrl_jax.training.rollout import ActorState, EpisodeLog, start_acting, unroll
+from segvisrl_jax.types import Outcome
+
+RECENT_EPISODES = 200  # what the progress bar's shares are taken over
+OUTCOMES = (Outcome.SUCCESS, Outcome.COLLISION, Outcome.FALL, Outcome.TIMEOUT)
+
+
+@struct.dataclass
+class TrainingState:
+    """Everything on the device that the next update depends on."""
+
+    learner: LearnerState
+    actor: ActorState
+    update_key: jax.Array
+
+
+@dataclasses.dataclass
+class HostState:
+    """Everything on the host that goes into a checkpoint, as JSON data."""
+
+    updates: int = 0
+    seconds: float = 0.0  # spent training, over all sessions of the run
+    recent: list[list[float]] = dataclasses.field(default_factory=list)  # outcome, return, decisions
+    best: list[float] = dataclasses.field(default_factory=list)  # rank of the best policy so far
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainResult:
+    """Where a run is and how it ended."""
+
+    run_dir: Path
+    finished: bool  # False where a signal ended it early
+    decisions: int
+    seconds: float
+
+
+class Trainer:
+    """One run: builds every part from the config, then updates until done or told to stop."""
+
+    def __init__(self, config: TrainConfig):
+        self.config = config
+        env = RoverEnv(config.env)
+        self.network: Network = make_network(config.arch, config.network, env.observation_shape)
+        self.learner: Learner = make_learner(self.network, config.ppo, config.num_updates)
+        self.batch = BatchEnv(env, config.ppo.num_envs)
+        self.policy: Policy = network_policy(self.network, config.arch)
+        self.evaluator = Evaluator(
+            RoverEnv(held_out_env(config.env)), self.policy, config.evaluation.num_slots
+        )
+        self._unroll = jax.jit(self._unroll_batch)
+
+    def start(self) -> TrainingState:
+        """The state before the first update."""
+        keys = jax.random.split(jax.random.key(self.config.seed), 3)
+        params_key, act_key, update_key = keys
+        learner = self.learner.init(params_key)
+        actor = jax.jit(lambda key: start_acting(key, self.batch, self.network))(act_key)
+        return TrainingState(learner, actor, update_key)
+
+    def update(self, state: TrainingState) -> tuple[TrainingState, dict[str, Any], EpisodeLog]:
+        """One rollout and one learning update."""
+        next_key, key = jax.random.split(state.update_key)
+        actor, trajectory, last_value, log = self._unroll(state.learner.params, state.actor)
+        learner, metrics = self.learner.update(state.learner, trajectory, last_value, key)
+        return TrainingState(learner, actor, next_key), metrics, log
+
+    def evaluate(self, params: Any) -> dict[str, Any]:
+        """The current policy on the validation scenes."""
+        stream = scene_stream(self.config.seed, VALIDATION_STREAM)
+        finished = self.evaluator.run(params, stream, self.config.evaluation.episodes)
+        return summarize(finished, self.evaluator.env)
+
+    def _unroll_batch(self, params: Any, actor: ActorState):
+        return unroll(params, actor, self.batch, self.network, self.config.ppo)
+
+
+def held_out_env(config: EnvConfig) -> EnvConfig:
+    """The same world with the paper's start, whatever training starts from."""
+    return replace_fields(config, random_start_yaw_share=0.0)
+
+
+def train(config: TrainConfig, say=print) -> TrainResult:
+    """Runs one training to its end, or to the first SIGINT or SIGTERM, which saves and returns.
+
+    Writes config.json, metrics.jsonl, TensorBoard events, checkpoints/ and policy/ (the best one) to the run folder.
+
+    Raises:
+        ConfigError: where the run folder exists and is not to be resumed, or cannot be.
+    """
+    run_dir = open_run_dir(config)
+    trainer = Trainer(config)
+    checkpoints = Checkpoints(run_dir)
+    state, host = trainer.start(), HostState()
+    if config.resume:
+        found, data = checkpoints.restore(checkpoints.latest, state)
+        state, host = found, HostState(**data)
+        say(f"going on from update {host.updates} of {config.num_updates}")
+    try:
+        with MetricsWriter(run_dir) as writer, StopSignals() as stop:
+            writer.resume_at(host.updates * config.ppo.decisions_per_update)
+            session = _Session(config, run_dir, trainer, checkpoints, writer, stop)
+            state = session.drive(state, host)
+    finally:
+        checkpoints.close()
+    done = host.updates * config.ppo.decisions_per_update
+    return TrainResult(run_dir, host.updates >= config.num_updates, done, host.seconds)
+
+
+@dataclasses.dataclass
+class _Session:
+    """One sitting of a run."""
+
+    config: TrainConfig
+    run_dir: Path
+    trainer: Trainer
+    checkpoints: Checkpoints
+    writer: MetricsWriter
+    stop: "StopSignals"
+
+    def drive(self, state: TrainingState, host: HostState) -> TrainingState:
+        """Updates until the run's end or a signal; the last state is always saved."""
+        config = self.config
+        recent = collections.deque(host.recent, maxlen=RECENT_EPISODES)
+        every = -(-config.evaluation.every_decisions // config.ppo.decisions_per_update)
+        total = config.num_updates * config.ppo.decisions_per_update
+        with ProgressDisplay(total, self._decisions(host), config.run_name) as display:
+            while host.updates < config.num_updates and not self.stop.requested:
+                began = time.monotonic()
+                state, metrics, log = self.trainer.update(state)
+                recent.extend(_finished_episodes(log))
+                host.updates += 1
+                row = _row(jax.device_get(metrics), log, recent)
+                host.seconds += time.monotonic() - began
+                row |= self._speed(host, time.monotonic() - began)
+                if host.updates % every == 0 or host.updates == config.num_updates:
+                    row |= self._evaluate(state, host)
+                self._report(row, host, display)
+                host.recent = [list(episode) for episode in recent]
+                if host.updates % config.checkpoint_every_updates == 0:
+                    self._save(state, host)
+        self._save(state, host)
+        return state
+
+    def _speed(self, host: HostState, seconds: float) -> dict[str, float]:
+        decisions = self.config.ppo.decisions_per_update
+        return {"time/seconds": host.seconds, "time/decisions_per_second": decisions / seconds}
+
+    def _evaluate(self, state: TrainingState, host: HostState) -> dict[str, float]:
+        summary = self.trainer.evaluate(state.learner.params)
+        rank = [summary["success"], -summary["collision"], summary["spl"]]
+        if rank >= (host.best or rank):
+            host.best = rank
+            scores = {**summary, "scenes": "validation", "decisions": self._decisions(host)}
+            save_policy(self.run_dir / "policy", self.config, state.learner.params, scores)
+        low, high = summary.pop("success_ci95")
+        kept = {k: v for k, v in summary.items() if isinstance(v, float)}
+        kept |= {"success_low": low, "success_high": high}
+        return {f"evaluation/{name}": value for name, value in kept.items()}
+
+    def _report(self, row: dict[str, float], host: HostState, display: ProgressDisplay) -> None:
+        decisions = self._decisions(host)
+        self.writer.write(decisions, row)
+        display.update(decisions, row)
+
+    def _save(self, state: TrainingState, host: HostState) -> None:
+        self.checkpoints.save(host.updates, state, dataclasses.asdict(host))
+
+    def _decisions(self, host: HostState) -> int:
+        return host.updates * self.config.ppo.decisions_per_update
+
+
+def open_run_dir(config: TrainConfig) -> Path:
+    """Makes the run's folder and writes the resolved config, or checks that it can be resumed.
+
+    Raises:
+        ConfigError: where it exists already and ``resume`` is off, or has nothing to resume, or was another run.
+    """
+    run_dir = Path(config.runs_dir) / config.run_name
+    config_file = run_dir / "config.json"
+    if not config.resume:
+        if run_dir.exists() and any(run_dir.iterdir()):
+            raise ConfigError(
+                f"run = {str(run_dir)!r}: exists already; go on with --resume, or choose another --run"
+            )
+        run_dir.mkdir(parents=True, exist_ok=True)
+        config_file.write_text(json.dumps(to_dict(config), indent=2) + "\n")
+        return run_dir
+    if not (run_dir / "checkpoints").is_dir() or not config_file.is_file():
+        raise ConfigError(f"run = {str(run_dir)!r}: has no checkpoint to resume; leave --resume out")
+    _require_same_run(config, json.loads(config_file.read_text()), run_dir)
+    return run_dir
+
+
+def _require_same_run(config: TrainConfig, before: dict[str, Any], run_dir: Path) -> None:
+    """Only the number of steps and bookkeeping may change when a run goes on."""
+    free = ("steps", "resume", "runs_dir", "run", "evaluation", "checkpoint_every_updates", "preset")
+    for name, value in to_dict(config).items():
+        if name not in free and before.get(name) != json.loads(json.dumps(value)):
+            was, now = before.get(name), value
+            if isinstance(value, dict):
+                changed = [key for key in value if (was or {}).get(key) != value[key]]
+                name = f"{name}.{changed[0]}" if changed else name
+                was, now = (was or {}).get(changed[0]), value.get(changed[0])
+            raise ConfigError(f"{name} = {now!r}: should be {was!r}, as when {run_dir} was started")
+
+
+class StopSignals:
+    """While open, the first SIGINT or SIGTERM asks to stop after the current update; a second one ends at once."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> "StopSignals":
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._request)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _request(self, number: int, frame: object) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+
+
+def _finished_episodes(log: EpisodeLog) -> list[tuple[int, float, int]]:
+    """(outcome, return, decisions) of the episodes that ended, in the order of time."""
+    outcome, returns, lengths = jax.device_get((log.outcome, log.episode_return, log.num_decisions))
+    ended = np.nonzero(outcome != Outcome.RUNNING)
+    return [(int(outcome[i]), float(returns[i]), int(lengths[i])) for i in zip(*ended, strict=True)]
+
+
+def _row(metrics: dict[str, Any], log: EpisodeLog, recent) -> dict[str, float]:
+    """What one update has to say, by the names that the log file uses."""
+    row = {f"ppo/{name}": float(value) for name, value in metrics.items()}
+    for name in ("progress", "collision", "fall", "timeout"):
+        row[f"reward/{name}"] = float(np.mean(jax.device_get(getattr(log.terms, name))))
+    if recent:
+        episodes = np.array(recent)
+        for kind in OUTCOMES:
+            row[f"episode/{kind.name.lower()}"] = float(np.mean(episodes[:, 0] == kind))
+        row["episode/return"] = float(np.mean(episodes[:, 1]))
+        row["episode/decisions"] = float(np.mean(episodes[:, 2]))
+    return row

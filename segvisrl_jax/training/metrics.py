@@ -1,0 +1,287 @@
+"""What a run writes down and shows while it runs: JSON lines, TensorBoard, a display of progress.
+
+A run's numbers are flat: ``{"episode/success": 0.93, "ppo/entropy": -0.4}`` at a step, which is the
+number of decisions so far. This file neither computes them nor draws figures.
+"""
+
+import collections
+import datetime
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from tensorboardX import SummaryWriter
+
+METRICS_FILE = "metrics.jsonl"
+TENSORBOARD_FOLDER = "tensorboard"
+STEP_KEY = "step"
+PLAIN_INTERVAL_S = 30.0  # between two lines where nobody watches a terminal: a log stays readable
+REFRESHES_PER_S = 4.0  # of the terminal: looks live, costs nothing next to training
+RATE_WINDOW_S = 60.0  # the speed shown is that of the last minute: it follows changes, not noise
+SHOWN = (  # what the display shows of a run's numbers: name, label, format
+    ("episode/success", "success", "{:.1%}"),
+    ("episode/collision", "collision", "{:.1%}"),
+    ("episode/fall", "fall", "{:.1%}"),
+    ("episode/timeout", "timeout", "{:.1%}"),
+    ("episode/return", "return", "{:.0f}"),
+    ("ppo/entropy", "entropy", "{:.2f}"),
+    ("ppo/explained_variance", "explained variance", "{:.2f}"),
+    ("evaluation/success", "held-out success", "{:.1%}"),
+)
+
+Item = TypeVar("Item")
+
+
+class MetricsWriter:
+    """Writes a run's numbers to ``metrics.jsonl`` and to TensorBoard event files.
+
+    Args:
+        run_dir: the run's folder; made if it is missing.
+        tensorboard: whether to write ``tensorboard/`` too.
+
+    A line is one JSON object with ``step`` and the numbers, on disk when ``write`` returns; what is
+    not finite is written as null. An existing file is continued; call ``resume_at`` first where the
+    run goes on from a checkpoint.
+    """
+
+    def __init__(self, run_dir: Path, tensorboard: bool = True) -> None:
+        self.path = Path(run_dir) / METRICS_FILE
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._events_dir = self.path.parent / TENSORBOARD_FOLDER if tensorboard else None
+        self._events: SummaryWriter | None = None
+        self._purge_step: int | None = None
+        _rewrite(self.path, lambda row: True)  # a line that a crash cut off is dropped
+        self._file = self.path.open("a", encoding="utf-8")
+
+    def resume_at(self, step: int) -> None:
+        """Drops every line beyond ``step``, so that a run resumed there does not write them twice.
+
+        TensorBoard is told to hide the events beyond ``step``.
+        """
+        self._file.close()
+        _rewrite(self.path, lambda row: row[STEP_KEY] <= step)
+        self._file = self.path.open("a", encoding="utf-8")
+        self._close_events()
+        self._purge_step = step + 1
+
+    def write(self, step: int, values: Mapping[str, Any]) -> None:
+        """Writes one line. Values are numbers or arrays of one number (NumPy, JAX)."""
+        numbers = {name: _number(value) for name, value in values.items()}
+        row = {STEP_KEY: int(step), **numbers}
+        self._file.write(json.dumps(row, allow_nan=False) + "\n")
+        self._file.flush()
+        if self._events_dir is None:
+            return
+        events = self._open_events(self._events_dir)
+        for name, number in numbers.items():
+            if number is not None:
+                events.add_scalar(name, number, int(step))
+        events.flush()
+
+    def close(self) -> None:
+        """Closes the files; a second call does nothing."""
+        self._file.close()
+        self._close_events()
+
+    def __enter__(self) -> "MetricsWriter":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _open_events(self, folder: Path) -> "SummaryWriter":
+        """The event writer; each gets a file of its own, even two within one second."""
+        if self._events is None:
+            from tensorboardX import SummaryWriter
+
+            number = len(list(folder.glob("events.*"))) if folder.exists() else 0
+            self._events = SummaryWriter(
+                str(folder), purge_step=self._purge_step, filename_suffix=f".{number}"
+            )
+        return self._events
+
+    def _close_events(self) -> None:
+        if self._events is not None:
+            self._events.close()
+            self._events = None
+
+
+def read_metrics(run_dir: Path) -> list[dict[str, Any]]:
+    """The lines of a run's ``metrics.jsonl`` in order; without the last one where it is cut off.
+
+    Raises:
+        FileNotFoundError: where the run has none.
+    """
+    rows = []
+    with (Path(run_dir) / METRICS_FILE).open(encoding="utf-8") as file:
+        for line in file:
+            if line.endswith("\n"):
+                rows.append(json.loads(line))
+    return rows
+
+
+def _rewrite(path: Path, is_kept: Callable[[dict[str, Any]], bool]) -> None:
+    """Keeps the whole lines for which ``is_kept(row)`` holds, in one move."""
+    if not path.exists():
+        return
+    text = path.read_text(encoding="utf-8")
+    whole = [line for line in text.splitlines(keepends=True) if line.endswith("\n")]
+    kept = "".join(line for line in whole if is_kept(json.loads(line)))
+    if kept == text:
+        return
+    temporary = path.with_suffix(".partial")
+    temporary.write_text(kept, encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def _number(value: Any) -> int | float | None:
+    """A plain number; None for what is not finite (JSON has no NaN)."""
+    number = value.item() if hasattr(value, "item") else value
+    if isinstance(number, int):
+        return int(number)
+    return float(number) if math.isfinite(number) else None
+
+
+class ProgressDisplay:
+    """How training stands: on a terminal a bar and the last numbers, elsewhere a line at times.
+
+    Args:
+        total: decisions of the whole run.
+        done: decisions already done when it starts (a resumed run).
+        description: what is shown in front.
+        console: rich's console; standard output where None.
+        plain_interval_s: least time between two lines where the console is no terminal.
+
+    Use it as a context manager; an exception or Ctrl-C passes through it and leaves the terminal in
+    order, with the last numbers on it.
+    """
+
+    def __init__(
+        self,
+        total: int,
+        done: int = 0,
+        description: str = "training",
+        console: Console | None = None,
+        plain_interval_s: float = PLAIN_INTERVAL_S,
+    ) -> None:
+        self._pace = _Pace(total, done)
+        self._description = description
+        self._console = console or Console()
+        self._plain = _PlainLines(self._console, plain_interval_s)
+        self._values: dict[str, float] = {}
+        self._bar = Progress(
+            TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[pace]}")
+        )
+        self._task = self._bar.add_task(description, total=total, completed=done, pace="starting")
+        self._live: Live | None = None
+
+    def __enter__(self) -> "ProgressDisplay":
+        if self._console.is_terminal:
+            self._live = Live(self._bar, console=self._console, refresh_per_second=REFRESHES_PER_S)
+            self._live.start()
+        return self
+
+    def update(self, decisions: int, values: Mapping[str, Any]) -> None:
+        """Shows what is done. A value that is not given, or not finite, stays as it was shown."""
+        self._pace.record(decisions)
+        for name, value in values.items():
+            number = _number(value)
+            if number is not None:
+                self._values[name] = number
+        if self._live is None:
+            self._plain.show(f"{self._description} {self._pace.describe()}  {self._numbers()}")
+            return
+        self._bar.update(self._task, completed=decisions, pace=self._pace.describe())
+        self._live.update(Group(self._bar, Text(self._numbers(), style="dim")))
+
+    def __exit__(self, *exception: object) -> None:
+        self._plain.finish()
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+    def _numbers(self) -> str:
+        known = [shown for shown in SHOWN if shown[0] in self._values]
+        return "  ".join(f"{label} {form.format(self._values[key])}" for key, label, form in known)
+
+
+def track(
+    items: Iterable[Item],
+    description: str,
+    total: int | None = None,
+    console: Console | None = None,
+    plain_interval_s: float = PLAIN_INTERVAL_S,
+) -> Iterator[Item]:
+    """Passes items on and shows how many are done, like ``ProgressDisplay``.
+
+    Args:
+        items: what to go through.
+        description: what is shown in front.
+        total: how many there are; ``len(items)`` where None.
+        console: rich's console; standard output where None.
+        plain_interval_s: least time between two lines where the console is no terminal.
+
+    Raises:
+        TypeError: where ``total`` is None and items have no length.
+    """
+    count = len(items) if total is None else total  # type: ignore[arg-type]
+    with ProgressDisplay(count, 0, description, console, plain_interval_s) as display:
+        for done, item in enumerate(items, start=1):
+            yield item
+            display.update(done, {})
+
+
+class _Pace:
+    """How much is done, how fast it goes, and how long it will take."""
+
+    def __init__(self, total: int, done: int) -> None:
+        self._total, self._started = total, time.monotonic()
+        self._recent = collections.deque([(self._started, done)])
+
+    def record(self, done: int) -> None:
+        now = time.monotonic()
+        self._recent.append((now, done))
+        while len(self._recent) > 2 and now - self._recent[1][0] > RATE_WINDOW_S:
+            self._recent.popleft()
+
+    def describe(self) -> str:
+        (first_time, first), (last_time, last) = self._recent[0], self._recent[-1]
+        rate = (last - first) / max(last_time - first_time, 1e-9)
+        left = _clock((self._total - last) / rate) if rate > 0 else "-"
+        share = last / max(self._total, 1)
+        spent = _clock(last_time - self._started)
+        speed = f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
+        return f"{last:,}/{self._total:,} {share:.0%}  {speed}/s  {spent} gone, {left} left"
+
+
+class _PlainLines:
+    """Prints the first line, then at most one per interval, and the last one at the end."""
+
+    def __init__(self, console: Console, interval_s: float) -> None:
+        self._console, self._interval_s = console, interval_s
+        self._printed_at, self._pending = -math.inf, ""
+
+    def show(self, line: str) -> None:
+        self._pending = line.strip()
+        if time.monotonic() - self._printed_at >= self._interval_s:
+            self.finish()
+
+    def finish(self) -> None:
+        if self._pending:
+            self._console.print(self._pending, soft_wrap=True, markup=False, highlight=False)
+            self._printed_at, self._pending = time.monotonic(), ""
+
+
+def _clock(seconds: float) -> str:
+    """Hours, minutes and seconds: 0:03:07."""
+    return str(datetime.timedelta(seconds=round(seconds)))

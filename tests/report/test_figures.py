@@ -1,0 +1,159 @@
+"""Figures: written without a display, readable in size, and showing what they were given."""
+
+import json
+
+import imageio.v3 as iio
+import matplotlib.figure
+import matplotlib.pyplot
+import numpy as np
+import pytest
+
+from segvisrl_jax.config import ConfigError
+from segvisrl_jax.report.figures import learning_curve, running_mean, success_by_scale
+from segvisrl_jax.report.layout import DrivenPath, SceneMap
+from segvisrl_jax.report.scene_figures import preprocessing, trajectories
+from segvisrl_jax.types import Outcome
+from segvisrl_jax.vision.classes import PALETTE
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that were saved while a test ran."""
+    figures = []
+    save = matplotlib.figure.Figure.savefig
+
+    def remember(figure, *arguments, **options):
+        figures.append(figure)
+        save(figure, *arguments, **options)
+
+    monkeypatch.setattr(matplotlib.figure.Figure, "savefig", remember)
+    return figures
+
+
+def write_run(run_dir, num_rows=200, keys=("success", "collision", "fall", "timeout", "return")):
+    run_dir.mkdir()
+    rng = np.random.default_rng(0)
+    rows = []
+    for index in range(num_rows):
+        row = {"step": 1000 * (index + 1), "time/seconds": 60.0 * index}
+        row |= {f"episode/{key}": rng.uniform(0, 0.2) if index > 2 else None for key in keys}
+        if index % 50 == 49:
+            row |= {"evaluation/success": 0.5, "evaluation/success_low": 0.4}
+            row |= {"evaluation/success_high": 0.7}
+        row |= {"ppo/entropy": -index / num_rows, "ppo/explained_variance": index / num_rows - 0.5}
+        rows.append(row)
+    (run_dir / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return run_dir
+
+
+def test_learning_curve_of_one_run(tmp_path, drawn):
+    run = write_run(tmp_path / "run")
+    image = iio.imread(learning_curve([run], tmp_path / "plots" / "curve.png"))
+    assert image.shape[1] >= 1000
+    figure = drawn[0]
+    assert figure.get_suptitle() == "run: 200,000 decisions in 3 h 19 min"
+    success = figure.axes[0]
+    labels = [text.get_text() for text in success.get_legend().get_texts()]
+    assert labels == ["training episodes", "held-out scenes"]
+    held_out = next(line for line in success.lines if line.get_linestyle() == "None")
+    np.testing.assert_allclose(held_out.get_xdata(), [50_000, 100_000, 150_000, 200_000])
+    segments = success.collections[0].get_segments()
+    np.testing.assert_allclose([ends[:, 1] for ends in segments], [[0.4, 0.7]] * 4)
+    assert all(axes.get_ylabel() for axes in figure.axes)
+    assert matplotlib.pyplot.get_fignums() == []
+
+
+def test_learning_curve_of_several_runs_and_of_missing_numbers(tmp_path, drawn):
+    runs = [write_run(tmp_path / "a"), write_run(tmp_path / "b", num_rows=1, keys=("success",))]
+    learning_curve(runs, tmp_path / "curve.png", title="Seeds")
+    labels = [text.get_text() for text in drawn[0].axes[0].get_legend().get_texts()]
+    assert labels == ["a", "b"]
+    assert drawn[0].get_suptitle() == "Seeds"
+    learning_curve(runs[1:], tmp_path / "curve.png")
+    texts = [text.get_text() for axes in drawn[1].axes for text in axes.texts]
+    assert texts == ["not written"]
+
+
+def test_learning_curve_refuses(tmp_path):
+    with pytest.raises(ConfigError, match="run_dirs"):
+        learning_curve([], tmp_path / "curve.png")
+    with pytest.raises(ConfigError, match=r"metrics\.jsonl"):
+        learning_curve([tmp_path], tmp_path / "curve.png")
+    with pytest.raises(ConfigError, match="path_png"):
+        learning_curve([write_run(tmp_path / "run")], tmp_path / "curve.jpg")
+
+
+def test_running_mean_keeps_constants_and_is_the_mean_of_its_window():
+    np.testing.assert_allclose(running_mean(np.full(1000, 3.0)), 3.0)
+    values = np.random.default_rng(0).normal(size=1000)
+    smoothed = running_mean(values)
+    assert smoothed[500] == pytest.approx(values[490:511].mean())
+    assert smoothed[0] == pytest.approx(values[:11].mean())
+    np.testing.assert_array_equal(running_mean(np.array([1.0, 5.0])), [1, 5])
+
+
+def test_success_by_scale(tmp_path, drawn):
+    rows = [
+        {"arch": arch, "scale": scale, "seed": seed, "success": rate, "success_low": rate - 0.1}
+        | {"success_high": min(1.0, rate + 0.1)}
+        for arch, scale, seed, rate in [
+            ("cnn", 10.0, 0, 0.6),
+            ("cnn", 10.0, 1, 0.8),
+            ("cnn", 40.0, 0, 0.5),
+            ("cnn_lstm", 10.0, 0, 0.9),
+        ]
+    ]
+    assert iio.imread(success_by_scale(rows, tmp_path / "sweep.png")).shape[1] >= 1000
+    axes = drawn[0].axes[0]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["cnn", "cnn_lstm"]
+    means = next(line for line in axes.lines if line.get_label() == "cnn")
+    np.testing.assert_allclose(means.get_ydata(), [0.7, 0.5])
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["10", "40"]
+    with pytest.raises(ConfigError, match="rows"):
+        success_by_scale([], tmp_path / "sweep.png")
+
+
+def scene_map(rocks=((1.0, 2.0), (-3.0, 0.5))):
+    rocks = np.array(rocks, np.float32).reshape(-1, 2)
+    radii = np.full(len(rocks), 0.2, np.float32)
+    return SceneMap(np.array([-12.0, 0.0]), np.array([3.0, 4.0]), rocks, radii)
+
+
+def test_trajectories_shows_circles_paths_and_outcomes(tmp_path, drawn):
+    line = np.linspace([-12, 0], [2, 3.5], 30)
+    paths = [
+        DrivenPath("cnn_lstm", line, Outcome.SUCCESS),
+        DrivenPath("P controller", line[:20], Outcome.COLLISION),
+    ]
+    image = iio.imread(trajectories(scene_map(), paths, tmp_path / "scene.png", title="Scene 3"))
+    assert image.shape[1] >= 1000
+    figure = drawn[0]
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels[-2:] == ["cnn_lstm: success", "P controller: collision"]
+    radii = sorted(patch.get_width() / 2 for patch in figure.axes[0].patches[1:])
+    np.testing.assert_allclose(radii, [0.2, 0.2, 0.5, 0.5, 1.0], rtol=1e-6)
+
+
+def test_trajectories_without_rocks_or_paths(tmp_path):
+    trajectories(scene_map(rocks=()), [], tmp_path / "scene.png")
+
+
+def test_scene_map_refuses_radii_that_do_not_fit():
+    with pytest.raises(ConfigError, match="rock_radius_m"):
+        SceneMap(np.zeros(2), np.ones(2), np.zeros((2, 2)), np.ones(3))
+
+
+def test_preprocessing_shows_the_three_images_in_a_row(tmp_path, drawn):
+    classes = np.zeros((108, 192), np.uint8)
+    classes[54:] = 1
+    classes[50:60, 40:60] = 2
+    raw = np.full((108, 192, 3), 77, np.uint8)
+    observation = PALETTE[classes[::10, ::10]]
+    image = iio.imread(preprocessing(raw, classes, observation, tmp_path / "steps.png"))
+    assert image.shape[1] >= 1000
+    shown = [axes.get_images()[0].get_array() for axes in drawn[0].axes]
+    np.testing.assert_array_equal(shown[0], raw)
+    np.testing.assert_array_equal(shown[1][55, 50], PALETTE[2])
+    np.testing.assert_array_equal(shown[2], observation)
+    titles = [axes.get_title() for axes in drawn[0].axes]
+    assert titles == ["Camera, 192 x 108", "Segmented, 192 x 108", "Observation, 20 x 11"]

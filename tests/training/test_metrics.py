@@ -1,0 +1,160 @@
+"""Metrics on disk, in TensorBoard, and on the screen."""
+
+import io
+import json
+import re
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rich.console import Console
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from segvisrl_jax.training.metrics import MetricsWriter, ProgressDisplay, read_metrics, track
+
+
+def scalars(run_dir, name):
+    events = EventAccumulator(str(run_dir / "tensorboard"))
+    events.Reload()
+    return [(event.step, pytest.approx(event.value)) for event in events.Scalars(name)]
+
+
+def test_a_line_is_one_json_object_and_on_disk_at_once(tmp_path):
+    with MetricsWriter(tmp_path / "run") as writer:
+        values = {"a/int": np.int64(3), "a/float": jnp.float32(0.5), "nan": float("nan")}
+        writer.write(64, {**values, "inf": np.float32(np.inf), "yes": True})
+        text = (tmp_path / "run" / "metrics.jsonl").read_text()
+    assert text.endswith("\n")
+    expected = {"step": 64, "a/int": 3, "a/float": 0.5, "nan": None, "inf": None, "yes": 1}
+    assert json.loads(text) == expected
+    assert scalars(tmp_path / "run", "a/float") == [(64, 0.5)]
+
+
+def test_refuses_what_is_not_one_number(tmp_path):
+    with MetricsWriter(tmp_path, tensorboard=False) as writer:
+        with pytest.raises(ValueError, match="size"):
+            writer.write(0, {"a": np.zeros(2)})
+        writer.write(1, {"a": 1.0})
+    assert read_metrics(tmp_path) == [{"step": 1, "a": 1.0}]
+    assert not (tmp_path / "tensorboard").exists()
+
+
+def test_opening_again_continues(tmp_path):
+    for step in (1, 2):
+        with MetricsWriter(tmp_path) as writer:
+            writer.write(step, {"a": step})
+    assert [row["step"] for row in read_metrics(tmp_path)] == [1, 2]
+    assert scalars(tmp_path, "a") == [(1, 1), (2, 2)]
+
+
+def test_resume_drops_what_lies_beyond_in_both_logs(tmp_path):
+    with MetricsWriter(tmp_path) as writer:
+        for step in range(5):
+            writer.write(step, {"a": step})
+    with MetricsWriter(tmp_path) as writer:
+        writer.resume_at(2)
+        writer.write(3, {"a": 30})
+    assert [row["a"] for row in read_metrics(tmp_path)] == [0, 1, 2, 30]
+    assert scalars(tmp_path, "a") == [(0, 0), (1, 1), (2, 2), (3, 30)]
+
+
+def test_a_line_that_a_crash_cut_off_is_dropped(tmp_path):
+    (tmp_path / "metrics.jsonl").write_text('{"step": 1, "a": 1}\n{"step": 2, "a"')
+    assert [row["step"] for row in read_metrics(tmp_path)] == [1]
+    with MetricsWriter(tmp_path, tensorboard=False) as writer:
+        writer.write(2, {"a": 5})
+    assert read_metrics(tmp_path) == [{"step": 1, "a": 1}, {"step": 2, "a": 5}]
+
+
+def plain_console():
+    return Console(file=io.StringIO(), force_terminal=False, width=40)
+
+
+def terminal_console():
+    return Console(file=io.StringIO(), force_terminal=True, width=160)
+
+
+NUMBERS = {
+    "episode/success": 0.912,
+    "episode/collision": 0.05,
+    "episode/fall": 0.0,
+    "episode/timeout": 0.038,
+    "episode/return": 843.2,
+    "ppo/entropy": -0.41,
+    "ppo/explained_variance": 0.83,
+    "evaluation/success": 0.955,
+}
+SHOWN = (
+    "success 91.2%",
+    "collision 5.0%",
+    "fall 0.0%",
+    "timeout 3.8%",
+    "return 843",
+    "entropy -0.41",
+)
+SHOWN += ("explained variance 0.83", "held-out success 95.5%", "2,048/10,000 20%", "/s", "left")
+
+
+@pytest.mark.parametrize("make_console", [plain_console, terminal_console])
+def test_display_shows_all_numbers(make_console):
+    console = make_console()
+    with ProgressDisplay(10_000, console=console) as display:
+        display.update(1024, {"evaluation/success": 0.955})
+        display.update(2048, {**NUMBERS, "evaluation/success": float("nan"), "other": 1.0})
+    shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", console.file.getvalue())
+    for text in SHOWN:
+        assert text in shown
+
+
+def test_plain_display_prints_first_and_last_within_an_interval():
+    console = plain_console()
+    with ProgressDisplay(100, console=console, plain_interval_s=3600.0) as display:
+        for done in range(10, 101, 10):
+            display.update(done, NUMBERS)
+    lines = console.file.getvalue().splitlines()
+    assert [line.split()[1] for line in lines] == ["10/100", "100/100"]
+
+
+def test_plain_display_prints_every_line_without_an_interval():
+    console = plain_console()
+    with ProgressDisplay(3, console=console, plain_interval_s=0.0) as display:
+        for done in (1, 2, 3):
+            display.update(done, {})
+    assert len(console.file.getvalue().splitlines()) == 3
+
+
+def test_speed_counts_from_where_a_resumed_run_begins(monkeypatch):
+    now = [1000.0]
+    monkeypatch.setattr("segvisrl_jax.training.metrics.time.monotonic", lambda: now[0])
+    console = plain_console()
+    with ProgressDisplay(1000, done=400, console=console, plain_interval_s=0.0) as display:
+        now[0] += 10
+        display.update(600, {})
+    assert "600/1,000 60%  20/s  0:00:10 gone, 0:00:20 left" in console.file.getvalue()
+
+
+@pytest.mark.parametrize("make_console", [plain_console, terminal_console])
+def test_interruption_passes_through_and_restores_the_cursor(make_console):
+    console = make_console()
+
+    def interrupted_run():
+        with ProgressDisplay(10, console=console) as display:
+            display.update(1, {})
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted_run()
+    shown = console.file.getvalue()
+    assert "1/10" in shown
+    assert shown.count("\x1b[?25l") == shown.count("\x1b[?25h")  # hidden as often as shown
+
+
+@pytest.mark.parametrize("make_console", [plain_console, terminal_console])
+def test_track_passes_items_on(make_console):
+    console = make_console()
+    assert list(track("abc", "testing", console=console)) == ["a", "b", "c"]
+    assert "testing" in console.file.getvalue()
+    assert "3/3 100%" in console.file.getvalue()
+    with pytest.raises(TypeError):
+        list(track(iter("abc"), "testing", console=console))
+    assert list(track(iter("abc"), "testing", total=3, console=console)) == ["a", "b", "c"]
