@@ -204,7 +204,7 @@ class Learner:
         num_chunks = self.config.num_envs // self.config.num_minibatches // self.chunk
         gradient, terms = jax.tree.map(lambda leaf: leaf / num_chunks, total)
         state = progress.state
-        norm = optax.global_norm(gradient)
+        norm = optax.tree.norm(gradient)
         updates, opt_state = self.optimizer.update(gradient, state.opt_state, state.params)
         stepped = Progress(
             state=dataclasses.replace(

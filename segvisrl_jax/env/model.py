@@ -1,8 +1,8 @@
-"""mjcf/ + settings + rocks + goal -> ``MjModel``, through MjSpec; and a state and a scene -> ``MjData``.
+"""mjcf/ + settings + rocks + goal -> ``MjModel``, through MjSpec; state + scene -> ``MjData``.
 
-This file owns the models and their names. It moves nothing (env/physics) and draws nothing (vision).
-Names: bodies ``rover``, ``front_left`` ... ``rear_right``, ``rock0`` ..., ``goal``; geoms start with ``rover``, ``ground``,
-``rock`` or ``goal``; the camera is ``d435``, the light ``sun``.
+This file owns the models and their names. It moves nothing and draws nothing.
+Names: bodies ``rover``, ``front_left`` ... ``rear_right``, ``rock0`` ..., ``goal``; geoms start
+with ``rover``, ``ground``, ``rock`` or ``goal``; the camera is ``d435``, the light ``sun``.
 """
 
 import mujoco
@@ -35,18 +35,19 @@ WHEEL_NAMES = ("front_left", "front_right", "rear_left", "rear_right")
 PARKED_Z_M = -1000.0
 """Height of a rock that the scene does not use: under the ground and beyond any far plane."""
 SUN_DISTANCE_M = 10.0
-"""From the ground to the light's place, for shadows only: a directional light shines the same from anywhere."""
+"""From the ground to the light's place; it matters for shadows only, the light is directional."""
 SHADOW_AHEAD_M = 9.0
-"""The middle of the square that gets shadows (its half side is shadowclip, 12 m), ahead of the rover: 3 m behind to 21 m ahead."""
+"""The middle of the square that gets shadows, ahead of the rover; its half side is world.xml's
+shadowclip, 12 m, so that shadows reach from 3 m behind the rover to beyond the far plane."""
 GROUND_GRID_M = 1.0
 """Spacing of the plane's grid lines, which only MuJoCo's wireframe view draws."""
 
 
 def build_model(config: EnvConfig) -> mujoco.MjModel:
-    """The full model: rover, ground, every rock of the library, goal, camera and sun; for drawing and for viewers.
+    """The full model, for drawing: rover, ground, all rocks of the library, goal, sun.
 
-    It moves exactly as ``build_physics_model``'s does: rocks and goal are mocap bodies, seen and not felt. Unused rocks
-    are parked out of sight.
+    It moves exactly as ``build_physics_model``'s does: rocks and goal are mocap bodies, seen and
+    not felt. Unused rocks are parked out of sight.
     """
     spec = _base_spec(config)
     library = rock_library(config.scene)
@@ -57,7 +58,7 @@ def build_model(config: EnvConfig) -> mujoco.MjModel:
 
 
 def build_physics_model(config: EnvConfig) -> mujoco.MjModel:
-    """The lean model: the rover's bodies, the wheels' contact spheres and the ground; same dynamics, same ``qpos``."""
+    """The lean model, for moving: what is felt and no more. Same dynamics, same ``qpos``."""
     spec = _base_spec(config)
     felt = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     for geom in list(spec.geoms):
@@ -74,7 +75,7 @@ def wheel_radius_m(model: mujoco.MjModel) -> float:
 def set_mujoco_state(
     model: mujoco.MjModel, data: mujoco.MjData, physics: PhysicsState, scene: Scene
 ) -> None:
-    """Puts one state and one scene into the ``MjData`` of a full model, and computes everything that drawing needs.
+    """Puts one state and one scene into the ``MjData`` of a full model, ready to be drawn.
 
     Args:
         model: from ``build_model``, with the rock library that ``scene`` was drawn from.
@@ -90,9 +91,8 @@ def set_mujoco_state(
         _stand(model, data, f"rock{shape}", xy, float(yaw))
     _stand(model, data, "goal", np.asarray(scene.goal_xy_m), float(scene.goal_yaw_rad))
     mujoco.mj_forward(model, data)
-    sun = np.asarray(
-        scene.sun_direction, np.float64
-    )  # after mj_forward, which puts the model's own light back
+    # After mj_forward, which puts the model's own light back.
+    sun = np.asarray(scene.sun_direction, np.float64)
     data.light("sun").xdir[:] = -sun
     rover = data.body("rover")
     middle = rover.xpos + SHADOW_AHEAD_M * rover.xmat.reshape(3, 3)[:, 0]
@@ -151,8 +151,7 @@ def _apply_scene(spec: mujoco.MjSpec, scene: SceneConfig) -> None:
 def _compile(spec: mujoco.MjSpec, physics: PhysicsConfig) -> mujoco.MjModel:
     """Compiles, and gears the motors: full command is the top speed.
 
-    Nothing rolls against the wheels on flat ground, so the servo has no droop to make up for: measured at full command,
-    0.1 % under the top speed.
+    Nothing resists the wheels' rolling on flat ground, so the servo has no droop to make up for.
     """
     model = spec.compile()
     model.actuator_ctrlrange[:] = (0.0, physics.top_speed_m_s / wheel_radius_m(model))
@@ -164,9 +163,9 @@ def _add_solid(
 ) -> None:
     """Adds one solid of a library as a mesh on a mocap body, parked out of sight.
 
-    Every corner of every face is a vertex of its own with the face's normal, so that faces are drawn flat (shared vertices
-    would share normals). MuJoCo moves a mesh into its inertial frame and the geom back by as much, so what is drawn
-    stands exactly where the library says.
+    Every corner of every face is a vertex of its own with the face's normal, so that faces are
+    drawn flat (shared vertices would share normals). MuJoCo moves a mesh into its inertial frame and
+    the geom back by as much, so what is drawn stands exactly where the library says.
     """
     corners = library.vertices_m[index][library.faces[index, : library.num_faces[index]]]
     corners = corners.astype(np.float64)

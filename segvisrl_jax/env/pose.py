@@ -44,7 +44,7 @@ def camera_pose(physics: PhysicsState, mount: CameraMount) -> CameraPose:
 def _product(
     left: Float32[Array, "*B 3 3"], right: Float32[Array, "3 k"]
 ) -> Float32[Array, "*B 3 k"]:
-    """In full float32: accelerators may take fewer bits by default, which is some pixels of the image."""
+    """In full float32: accelerators may take fewer bits by default, which costs pixels."""
     return jnp.matmul(left, right, precision="highest")
 
 
@@ -61,7 +61,7 @@ def rotation_matrix(quaternion: Float32[Array, "*B 4"]) -> Float32[Array, "*B 3 
 
 
 def yaw_rad(qpos: Float32[Array, "*B 11"]) -> Float32[Array, "*B"]:
-    """Heading in (-pi, pi]: the direction of the rover's x axis on the ground, from world x towards y."""
+    """Heading in (-pi, pi]: the rover's x axis on the ground, from world x towards y."""
     w, x, y, z = (qpos[..., 3 + k] for k in range(4))
     return jnp.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
 

@@ -1,0 +1,1 @@
+"""Figures and videos of runs, scenes and episodes."""

@@ -1,11 +1,10 @@
 """What figures and videos draw a scene from: plain NumPy arrays in the world frame."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-from segvisrl_jax.config import require
 from segvisrl_jax.types import Outcome
 
 GROUND = "#d9d6cf"  # the map, seen from above
@@ -35,10 +34,6 @@ class SceneMap:
     collision_radius_m: float = 0.5
     goal_radius_m: float = 1.0
 
-    def __post_init__(self) -> None:
-        rocks, radii = len(self.rock_xy_m), len(self.rock_radius_m)
-        require(rocks == radii, "rock_radius_m", f"{radii} radii", f"one for each of {rocks} rocks")
-
 
 @dataclass(frozen=True)
 class DrivenPath:
@@ -46,4 +41,4 @@ class DrivenPath:
 
     label: str
     xy_m: Float[np.ndarray, "T 2"]
-    outcome: Outcome = field(default=Outcome.RUNNING)
+    outcome: Outcome = Outcome.RUNNING

@@ -1,0 +1,1 @@
+"""Learning, evaluating, and what a run writes down."""

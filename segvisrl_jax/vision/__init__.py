@@ -1,0 +1,1 @@
+"""From a scene and a camera pose to the observation: renderers, and bicubic downsampling."""

@@ -24,6 +24,15 @@ NO_CROSSING_PX = 1e9  # a row that a polygon does not touch: its span starts her
 NOT_A_FACE_M = 1.0  # plane offset of padding (with a zero normal): never turned to the camera
 
 
+GROUND_FAR_SHIFT_PX = 1 / 512
+"""How much lower OpenGL draws the ground's far edge when it is all but level.
+
+Rasterisers move the ends of every edge to a grid of 1/256 pixel, and a pixel whose centre is then right on an upper
+edge is outside. MuJoCo draws the ground in small squares, so the cut at the far plane is a row of short, rounded edges: a row
+of pixels is outside already where the exact line is within half a grid step above its centres.
+"""
+
+
 @dataclasses.dataclass(frozen=True)
 class Projection:
     """The camera's constants: image size, focal length in pixels, near and far depth in metres."""
@@ -38,14 +47,24 @@ class Projection:
     def from_config(cls, camera: CameraConfig) -> "Projection":
         """Square pixels, principal point in the middle."""
         focal = camera.width_px / 2 / math.tan(math.radians(camera.horizontal_fov_deg) / 2)
-        import os
-        return cls(camera.width_px, camera.height_px, focal, camera.near_m, float(os.environ.get("FAR",20)))
+        return cls(camera.width_px, camera.height_px, focal, camera.near_m, _drawn_far_m(camera))
 
     def to_image(self, points_m: Float32[Array, "*P 3"]) -> Float32[Array, "*P 2"]:
         """(u, v) of points in the camera frame; points nearer than the near plane give finite nonsense."""
         scale = self.focal_px / jnp.maximum(points_m[..., 2:], self.near_m)
         middle = jnp.array([self.width_px / 2, self.height_px / 2], jnp.float32)
         return points_m[..., :2] * scale + middle
+
+
+def _drawn_far_m(camera: CameraConfig) -> float:
+    """Where MuJoCo's reversed-depth matrix puts the far plane in float32 (20 m becomes 19.9995 m).
+
+    OpenGL clips where a z + b = 0; a is a small difference of large numbers.
+    """
+    near, far = np.float32(camera.near_m), np.float32(camera.far_m)
+    a = np.float32(0.5) * ((far + near) / (far - near)) - np.float32(0.5)
+    b = np.float32(0.5) * (np.float32(2.0) * far * near / (far - near))
+    return float(b) / float(a)
 
 
 @struct.dataclass
@@ -182,12 +201,10 @@ def ground_sides(map_size_m: float, camera: CameraPose, projection: Projection) 
     middles = np.arange(1, 8, 2)
     edges = np.stack([np.repeat(middles, 2), np.stack([middles - 1, (middles + 1) % 8], 1).ravel()], axis=1)
     points = rotate(camera_axes(camera), outline_m - camera.position_m)
-    ends, is_clipped_away, cuts = _clip(points, edges, projection)
+    ends, is_clipped_away, cuts = _clip(points, edges, projection, GROUND_FAR_SHIFT_PX)
     near_ends, far_ends, near_cut, far_cut = _cut_faces(np.arange(len(edges))[None], cuts)
     is_used = jnp.concatenate([~is_clipped_away, near_cut, far_cut])
     is_used &= camera.position_m[2] > 0.0
-    import os
-    far_ends = far_ends.at[..., 1].add(float(os.environ.get("BIAS", 0)))
     return _sides(jnp.concatenate([ends, near_ends, far_ends]), is_used)
 
 
@@ -202,7 +219,10 @@ class _Cuts:
 
 
 def _clip(
-    points_m: Float32[Array, "V 3"], edges: Int32[Array, "E 2"] | Int32[np.ndarray, "E 2"], projection: Projection
+    points_m: Float32[Array, "V 3"],
+    edges: Int32[Array, "E 2"] | Int32[np.ndarray, "E 2"],
+    projection: Projection,
+    far_shift_v_px: float = 0.0,
 ) -> tuple[Float32[Array, "E 2 2"], Bool[Array, "E"], _Cuts]:
     """(ends of each edge in the image after clipping, whether nothing is left, where it was cut).
 
@@ -212,6 +232,7 @@ def _clip(
     depth = ends[..., 2]
     near, near_cut = _intersect(ends, projection.near_m, projection)
     far, far_cut = _intersect(ends, projection.far_m, projection)
+    far = far + jnp.array([0.0, far_shift_v_px], jnp.float32)
     image = projection.to_image(points_m)[edges]
     image = jnp.where((depth < projection.near_m)[..., None], near[:, None], image)
     image = jnp.where((depth > projection.far_m)[..., None], far[:, None], image)

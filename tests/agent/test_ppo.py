@@ -43,6 +43,9 @@ def learner_of(arch: str, execution: str = "auto", chunk: int | None = None) -> 
     return make_learner(built(arch), CONFIG, TOTAL_UPDATES, execution, chunk)
 
 
+loss_of = jax.jit(ppo_loss, static_argnums=(2, 3))
+
+
 @functools.partial(jax.jit, static_argnums=0)
 def act(network: Network, params, carry, observation, reset, key):
     carry, output = network.step(params, carry, observation, reset)
@@ -127,7 +130,7 @@ def test_loss_by_hand() -> None:
         carry=(),
     )
     config = dataclasses.replace(CONFIG, value_cost=0.3, entropy_cost=0.01)
-    loss, terms = ppo_loss(params, batch, network, config)
+    loss, terms = loss_of(params, batch, network, config)
     entropy = 1 + math.log(2 * math.pi)
     np.testing.assert_allclose(terms.policy_loss, -(1.1 + 1.2 * 2) / 2, rtol=1e-5)
     np.testing.assert_allclose(terms.value_loss, 0.5 * (4 + 16) / 2, rtol=1e-5)
@@ -143,11 +146,15 @@ def test_loss_by_hand() -> None:
 @pytest.mark.parametrize("arch", ["cnn_lstm", "cnn", "mlp"])
 def test_log_probs_recomputed_before_the_first_update_are_those_stored(arch: str) -> None:
     network, (state, trajectory) = built(arch), rollout(arch)
-    unroll = jax.jit(network.unroll)
-    _, output = unroll(state.params, trajectory.carry, trajectory.observation, trajectory.reset)
+    inputs = (trajectory.carry, trajectory.observation, trajectory.reset)
+    _, output = jax.jit(network.unroll)(state.params, *inputs)
     recomputed = DiagonalGaussian(output.mean, output.log_std).log_prob(trajectory.action)
     np.testing.assert_allclose(recomputed, trajectory.log_prob, atol=1e-4)
     np.testing.assert_allclose(output.value, trajectory.value, atol=1e-5)
+    batch, _ = make_batch(trajectory, jnp.ones(B), CONFIG)
+    _, terms = loss_of(state.params, batch, network, CONFIG)
+    np.testing.assert_allclose(terms.approx_kl, 0.0, atol=1e-6)
+    assert terms.clip_fraction == 0
 
 
 @pytest.mark.parametrize("bootstrap", [True, False])
@@ -194,7 +201,7 @@ def test_minibatches_cut_environments_and_never_time() -> None:
 
 def test_both_executions_and_all_chunks_give_the_same_result() -> None:
     state, trajectory = rollout("cnn_lstm")
-    variants = [("host", 4), ("host", 1), ("fused", 4), ("fused", 2)]
+    variants = [("host", 4), ("host", 1), ("fused", 2)]
     results = [
         update(learner_of("cnn_lstm", execution, chunk), state, trajectory)
         for execution, chunk in variants

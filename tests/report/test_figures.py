@@ -138,11 +138,6 @@ def test_trajectories_without_rocks_or_paths(tmp_path):
     trajectories(scene_map(rocks=()), [], tmp_path / "scene.png")
 
 
-def test_scene_map_refuses_radii_that_do_not_fit():
-    with pytest.raises(ConfigError, match="rock_radius_m"):
-        SceneMap(np.zeros(2), np.ones(2), np.zeros((2, 2)), np.ones(3))
-
-
 def test_preprocessing_shows_the_three_images_in_a_row(tmp_path, drawn):
     classes = np.zeros((108, 192), np.uint8)
     classes[54:] = 1

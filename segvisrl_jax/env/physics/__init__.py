@@ -1,4 +1,4 @@
-"""One protocol, two engines: ``native`` (MuJoCo C on CPU threads) and ``mjx`` (MJX, on the device)."""
+"""One protocol, two engines: ``native`` (MuJoCo C, CPU threads) and ``mjx`` (on the device)."""
 
 import jax
 
@@ -9,9 +9,10 @@ __all__ = ["PhysicsEngine", "make_engine"]
 
 
 def make_engine(config: EnvConfig) -> PhysicsEngine:
-    """The engine that ``config.physics.engine`` names; ``auto``: mjx on an accelerator, else native.
+    """The engine that ``config.physics.engine`` names; auto: mjx on an accelerator, else native.
 
-    Build it before any other use of JAX in the process: the native engine changes how JAX's CPU backend starts.
+    Build it before any other use of JAX in the process: for the native engine JAX's CPU backend
+    must start in its own way (``native.make_callbacks_safe``).
 
     Raises:
         ConfigError: where the engine cannot run here, or there is none of that name.

@@ -1,4 +1,4 @@
-"""What a physics engine must do, and what both engines share. native.py and mjx.py are the two there are."""
+"""What a physics engine must do, and what the two there are (native.py, mjx.py) share."""
 
 from typing import Protocol
 
@@ -12,13 +12,13 @@ from segvisrl_jax.env.model import WHEEL_NAMES
 from segvisrl_jax.types import Action, PhysicsState
 
 MAX_COORDINATE = 1e8
-"""A coordinate or speed (SI units) beyond this has diverged; wheels turn by less in a million decisions at 2 m/s."""
+"""What is beyond this (SI units) has diverged; wheels turn by less in a million decisions."""
 SETTLING_TIME_S = 3.0
-"""Longer than the wheels' contact needs to come to rest (its time constant is 0.04 s, under the Moon's gravity)."""
+"""Longer than the wheels need to come to rest: the time constant of their contact is 0.04 s."""
 
 
 class PhysicsEngine(Protocol):
-    """Moves the rover for one decision. Stateless to the caller: jit, scan and vmap over everything.
+    """Moves the rover for one decision. No state of its own: jit, scan and vmap over everything.
 
     Rocks and goal are not part of the physics: they are seen, not felt.
     """
@@ -34,11 +34,11 @@ class PhysicsEngine(Protocol):
 
         Args:
             state: where the rover is, unbatched.
-            action: (2,) left and right wheel speed as a share of the top speed; clipped to [0, 1] here.
+            action: (2,) left and right wheel speed as a share of the top speed, clipped to [0, 1].
 
         Returns:
-            The states at the judged instants, stacked: ``qpos`` (J, 11), ``qvel`` (J, 10). A state that diverged is
-            non-finite from there on; it is never silently reset.
+            The states at the judged instants, stacked: ``qpos`` (J, 11), ``qvel`` (J, 10). A state
+            that diverged is non-finite from there on; it is never silently reset.
         """
         ...
 
@@ -49,7 +49,7 @@ def steps_per_judgement(config: EnvConfig) -> int:
 
 
 def rest_height_m(model: mujoco.MjModel) -> float:
-    """Height of the rover's origin when it stands still on the ground: the wheels sink in by some tenths of a mm."""
+    """Height of the rover's origin at rest on the ground, into which the wheels sink by 0.6 mm."""
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, nstep=round(SETTLING_TIME_S / model.opt.timestep))
     return float(data.qpos[2])
@@ -65,7 +65,7 @@ def at_rest(xy_m: Float[Array, "2"], yaw_rad: Float[Array, ""], height_m: float)
 
 
 def wheel_command(action: Float[Array, "2"], max_wheel_speed_rad_s: float) -> Float32[Array, "4"]:
-    """Wheel speeds in the actuators' order, from the left and right share of the top speed; clipped to [0, 1]."""
+    """Wheel speeds in the actuators' order, from the two shares of the top speed."""
     share = jnp.clip(jnp.asarray(action, jnp.float32), 0.0, 1.0)
     side = np.array([0 if "left" in wheel else 1 for wheel in WHEEL_NAMES])
     return share[side] * max_wheel_speed_rad_s
@@ -74,7 +74,7 @@ def wheel_command(action: Float[Array, "2"], max_wheel_speed_rad_s: float) -> Fl
 def keep_diverged(
     start: PhysicsState, action: Float[Array, "2"], states: PhysicsState
 ) -> PhysicsState:
-    """Makes every state NaN from the first diverged one on; a diverged start or action counts as the first.
+    """Makes every state NaN from the first diverged one on; start and action count as the first.
 
     Args:
         start: where the decision began, unbatched.

@@ -50,13 +50,13 @@ class MjxEngine:
             jnp.asarray(state.qvel, jnp.float32),
             jnp.zeros(10, jnp.float32),
         )
-        # Full float32 products: the reduced precision that some accelerators take by default moves the rover.
+        # Full float32 products: accelerators may take fewer bits by default, which moves the rover.
         with jax.default_matmul_precision("highest"):
             _, states = jax.lax.scan(judge, start, None, length=self._num_judgements)
         return engine.keep_diverged(state, action, states)
 
     def _step(self, carry: _Carry, control: Float32[Array, "4"]) -> _Carry:
-        """One MuJoCo step. Only what the next step needs is carried; the rest of ``mjx.Data`` follows from it."""
+        """One MuJoCo step, carrying only what the next one needs: the rest of the data follows."""
         qpos, qvel, warmstart = carry
         data = self._data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=control)
         data = mjx.step(self._model, data)

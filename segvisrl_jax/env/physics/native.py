@@ -1,7 +1,7 @@
 """The physics in MuJoCo's C library, on a pool of threads that lives as long as the engine.
 
-One callback a decision moves the whole batch, however many ``vmap``s led to it. Works on any JAX backend that has JAX's
-cpu platform beside it; it is fast where the program itself runs on the CPU.
+One callback a decision moves the whole batch, however many ``vmap``s led to it. Works on any JAX
+backend that has JAX's cpu platform beside it; it is fast where the program itself runs on the CPU.
 """
 
 import os
@@ -23,14 +23,15 @@ from segvisrl_jax.types import Action, PhysicsState
 def make_callbacks_safe() -> None:
     """Makes JAX's CPU backend run programs in the calling thread.
 
-    Otherwise a program that waits for its callback can hold the very threads which the callback's arguments wait for, and
-    hang (jax issues 24219, 25861). JAX reads this once, when its first array or device is made: call it before that.
+    Otherwise a program that waits for its callback can hold the very threads which the callback's
+    arguments wait for, and hang (jax-ml/jax issues 24219, 25861). JAX reads this once, when its
+    first array is made: call it before that.
     """
     jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 
 class NativeEngine:
-    """``PhysicsEngine`` through ``mujoco.rollout``. Equal states and actions give equal bits, whatever the batch."""
+    """``PhysicsEngine`` through ``mujoco.rollout``. The bits do not depend on batch or threads."""
 
     name = "native"
 
@@ -52,9 +53,8 @@ class NativeEngine:
         self._data = [mujoco.MjData(self._model) for _ in range(num_threads)]
         # With one thread there is no pool: the calling thread does the work.
         self._pool = mujoco.rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
-        self._lock = (
-            threading.Lock()
-        )  # several devices may call at once; the threads' MjData are shared
+        # Programs on several devices may call at once, and the threads' MjData are shared.
+        self._lock = threading.Lock()
 
     def place(self, xy_m: Float32[Array, "2"], yaw_rad: Float32[Array, ""]) -> PhysicsState:
         """See ``PhysicsEngine.place``."""
@@ -63,33 +63,36 @@ class NativeEngine:
     def advance(self, state: PhysicsState, action: Action) -> PhysicsState:
         """See ``PhysicsEngine.advance``."""
         control = engine.wheel_command(action, self._max_wheel_speed)
-        shape = PhysicsState(
-            qpos=jax.ShapeDtypeStruct((self._num_judgements, 11), jnp.float32),
-            qvel=jax.ShapeDtypeStruct((self._num_judgements, 10), jnp.float32),
+        judged = (self._num_judgements,)
+        shapes = tuple(jax.ShapeDtypeStruct((*judged, size), jnp.float32) for size in (11, 10))
+        qpos, qvel = jax.pure_callback(
+            self._advance_batch,
+            shapes,
+            state.qpos,
+            state.qvel,
+            control,
+            vmap_method="broadcast_all",
         )
-        states = jax.pure_callback(
-            self._advance_batch, shape, state.qpos, state.qvel, control, vmap_method="broadcast_all"
-        )
-        return engine.keep_diverged(state, action, states)
+        return engine.keep_diverged(state, action, PhysicsState(qpos=qpos, qvel=qvel))
 
-    def _advance_batch(self, qpos: Array, qvel: Array, control: Array) -> PhysicsState:
-        """The callback: any leading axes in, the same leading axes and J out. NumPy inside: JAX here could hang."""
-        qpos, qvel, control = np.asarray(qpos), np.asarray(qvel), np.asarray(control)
-        batch = qpos.shape[:-1]
-        start = np.concatenate([qpos, qvel], axis=-1).reshape(-1, 21)
-        states = self._roll_out(start, control.reshape(-1, 1, 4))
-        states = states.astype(np.float32).reshape(*batch, self._num_judgements, 21)
-        return PhysicsState(qpos=states[..., :11], qvel=states[..., 11:])
+    def _advance_batch(
+        self, qpos: Array, qvel: Array, control: Array
+    ) -> tuple[Float32[np.ndarray, "*B J 11"], Float32[np.ndarray, "*B J 10"]]:
+        """The callback: any leading axes in, the same and J out. NumPy only: JAX can hang."""
+        start = np.concatenate([np.asarray(qpos), np.asarray(qvel)], axis=-1).reshape(-1, 21)
+        states = self._roll_out(start, np.asarray(control).reshape(-1, 1, 4))
+        states = states.astype(np.float32).reshape(*qpos.shape[:-1], self._num_judgements, 21)
+        return states[..., :11], states[..., 11:]
 
     def _roll_out(
         self, start: Float[np.ndarray, "B 21"], control: Float[np.ndarray, "B 1 4"]
     ) -> Float[np.ndarray, "B J 21"]:
         """Judged states of a flat batch; NaN where MuJoCo warned.
 
-        MuJoCo's full physics state is time, qpos, qvel; the solver starts cold (without ``initial_warmstart``). At a
-        warning ``rollout`` stops stepping that trajectory and repeats its state, which may be finite: its time gives it
-        away. What is not finite to begin with never reaches MuJoCo, which would write a warning to disk every time;
-        ``engine.keep_diverged`` answers for it.
+        MuJoCo's full physics state is time, qpos, qvel; the solver starts cold. At a
+        warning ``rollout`` stops stepping that trajectory and repeats its state, which may be
+        finite: its time gives it away. What is not finite to begin with never reaches MuJoCo, which
+        would print a warning every time; ``engine.keep_diverged`` answers for it.
         """
         finite = np.isfinite(start).all(axis=1) & np.isfinite(control).all(axis=(1, 2))
         start = np.where(finite[:, None], start, self._rest)
@@ -111,6 +114,6 @@ def _require_cpu_platform() -> None:
         jax.devices("cpu")
     except RuntimeError:
         raise ConfigError(
-            "physics.engine = 'native': should be 'mjx' here, because callbacks need JAX's cpu platform beside the "
-            "accelerator (or set JAX_PLATFORMS to both, e.g. cuda,cpu)"
+            "physics.engine = 'native': should be 'mjx' here, because callbacks need JAX's cpu "
+            "platform beside the accelerator (or set JAX_PLATFORMS to both, e.g. cuda,cpu)"
         ) from None

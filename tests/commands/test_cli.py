@@ -1,0 +1,99 @@
+"""The program as a user types it: what it prints, what it leaves, and one line for every mistake."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+PROGRAM = [sys.executable, "-m", "segvisrl_jax.cli"]
+SMOKE = ["--preset", "smoke", "--steps", "256"]
+SUMMARY_KEYS = {
+    "method", "episodes", "success", "collision", "fall", "timeout", "success_ci95", "spl", "path_ratio",
+    "mean_time_s", "min_clearance_m", "seed", "config",
+}  # fmt: skip
+
+
+def segvisrl(*words, cwd):
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    return subprocess.run([*PROGRAM, *map(str, words)], cwd=cwd, env=environment, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["fly"], ["'fly'", "train", "eval"]),
+        (["train", "--arch", "resnet"], ["--arch", "resnet", "cnn_lstm_raw"]),
+        (["train", "--preset", "huge"], ["preset", "huge", "smoke"]),
+        (["train", "--env.camera.scale", "-2"], ["scale", "-2", "1 or more"]),
+        (["train", "--env.camera.scale", "600"], ["scale", "600", "at least 4 pixels"]),
+        (["train", "--env.scene.num-rocks", "60", "--env.scene.rock-radius-max-m", "2"], ["num_rocks", "60", "2.0 m"]),
+        (["train", "--ppo.num-minibatches", "5"], ["num_minibatches", "5", "divisor of num_envs = 32"]),
+        (["train", "--steps", "many"], ["--steps", "many"]),
+        (["train", "--wheels", "6"], ["--wheels"]),
+        (["train", "--env.renderer", "crayon"], ["--env.renderer", "crayon", "scanline"]),
+        (["train", "--env.physics.engine", "bullet"], ["bullet", "native"]),
+        (["train", "--resume", "--run", "nothing"], ["nothing", "no checkpoint"]),
+        (["eval"], ["--run, --policy, --controller", "exactly one"]),
+        (["eval", "--controller", "p", "--policy", "x"], ["exactly one"]),
+        (["eval", "--controller", "q"], ["--controller", "q"]),
+        (["eval", "--controller", "p", "--episodes", "0"], ["--episodes", "0"]),
+        (["eval", "--controller", "p", "--num-rocks", "-1"], ["num_rocks", "-1"]),
+        (["eval", "--controller", "p", "--json", "no/such/folder/x.json"], ["--json", "folder that exists"]),
+        (["eval", "--policy", "nowhere"], ["nowhere", "policy.json"]),
+        (["eval", "--run", "nowhere"], ["nowhere", "policy"]),
+        (["demo", "--controller", "p", "--output", "x.avi"], ["--output", "x.avi", ".mp4"]),
+        (["sweep", "--scales", "900"], ["scale", "900", "at least 4 pixels"]),
+    ],
+)
+def test_a_mistake_gets_exit_code_2_and_one_line(words, says, tmp_path):
+    done = segvisrl(*words, cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    lines = done.stderr.strip().splitlines()
+    assert len(lines) == 1, done.stderr
+    for part in says:
+        assert part in lines[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_lists_the_commands_and_their_options(tmp_path):
+    assert "train" in segvisrl("--help", cwd=tmp_path).stdout
+    options = segvisrl("train", "--help", cwd=tmp_path)
+    assert options.returncode == 0
+    assert "--env.camera.scale" in options.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arch", ["cnn_lstm", "cnn", "cnn_lstm_raw", "mlp"])
+def test_train_eval_demo_as_a_user_does(arch, tmp_path):
+    trained = segvisrl("train", "--arch", arch, *SMOKE, cwd=tmp_path)
+    assert trained.returncode == 0, trained.stderr
+    assert "differs from the paper's settings" in trained.stdout
+    run = tmp_path / "runs" / f"{arch}-smoke-seed0"
+    for name in ("config.json", "metrics.jsonl", "eval.json", "learning_curve.png", "rollout.mp4"):
+        assert (run / name).stat().st_size > 0
+    assert f"segvisrl eval --run runs/{run.name}" in trained.stdout
+
+    again = segvisrl("train", "--arch", arch, *SMOKE, cwd=tmp_path)
+    assert again.returncode == 2
+    assert "exists already" in again.stderr
+
+    judged = segvisrl("eval", "--run", run, "--episodes", "6", "--num-rocks", "2", "--json", "out.json", cwd=tmp_path)
+    assert judged.returncode == 0, judged.stderr
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert SUMMARY_KEYS <= set(result)
+    assert result["success"] + result["collision"] + result["fall"] + result["timeout"] == pytest.approx(1)
+    assert result["config"]["scene"]["num_rocks"] == 2
+
+
+def test_controllers_need_no_images(tmp_path):
+    done = segvisrl("eval", "--controller", "p", "--episodes", "40", "--seed", "3", "--json", "p.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "p.json").read_text())
+    assert SUMMARY_KEYS <= set(result)
+    assert result["episodes"] == 40
+    assert result["seed"] == 3
+    assert result["success"] > 0.75
+    low, high = result["success_ci95"]
+    assert 0 <= low <= result["success"] <= high <= 1

@@ -1,0 +1,180 @@
+"""The environment keeps brax's contract, compiles once, resets onto fresh scenes, and shows MuJoCo its state."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from brax.envs.base import Env, State
+
+import segvisrl_jax
+from segvisrl_jax.config import ConfigError
+from segvisrl_jax.env.wrappers import BatchEnv
+from segvisrl_jax.types import Outcome
+
+SMALL = {"scale": 120}
+
+
+@functools.lru_cache(maxsize=8)
+def make(obs="segmentation", physics="native", **fields):
+    return segvisrl_jax.make_env(obs=obs, physics=physics, **{**SMALL, **fields})
+
+
+@pytest.mark.parametrize("physics", ["native", "mjx"])
+def test_brax_contract_and_one_compilation(physics):
+    env = make(physics=physics)
+    assert isinstance(env, Env)
+    assert env.action_size == 2
+    assert env.backend == physics
+    step = jax.jit(env.step)
+    state = jax.jit(env.reset)(jax.random.key(0))
+    assert isinstance(state, State)
+    assert state.obs.shape == env.observation_shape == env.observation_size == (9, 16, 3)
+    assert state.obs.dtype == jnp.uint8
+    metrics = set(state.metrics)
+    for _ in range(3):
+        state = step(state, jnp.array([0.7, 1.0]))
+    assert step._cache_size() == 1
+    assert set(state.metrics) == metrics
+    assert float(state.reward) == pytest.approx(
+        sum(float(v) for k, v in state.metrics.items() if k.startswith("reward/")), abs=1e-4
+    )
+
+
+def test_whole_episodes_are_finite_and_end():
+    env = make("state")
+    batch = BatchEnv(env, 16)
+    state = jax.jit(batch.reset)(jax.random.key(1))
+
+    def decide(carry, key):
+        action = jax.random.uniform(key, (16, 2), minval=-0.5, maxval=1.5)
+        carry, step = batch.step(carry, action)
+        return carry, (step, batch.observe(carry))
+
+    _, (steps, seen) = jax.jit(lambda s: jax.lax.scan(decide, s, jax.random.split(jax.random.key(2), 120)))(state)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((steps, seen)))
+    done = np.asarray(steps.done)
+    assert done.sum() >= 16
+    assert np.array_equal(done > 0, np.asarray(steps.outcome) != Outcome.RUNNING)
+    assert not np.any((np.asarray(steps.terminated) > 0) & (np.asarray(steps.truncated) > 0))
+    assert np.array_equal(np.asarray(steps.truncated) > 0, np.asarray(steps.outcome) == Outcome.TIMEOUT)
+    assert np.asarray(steps.num_decisions).max() == 100
+
+
+def test_driving_straight_at_the_goal_succeeds_and_pays_what_it_covers():
+    env = make("state", num_rocks=0)
+    state = jax.jit(env.reset)(jax.random.key(3))
+    rover = state.pipeline_state
+    scene = rover.scene.replace(goal_xy_m=jnp.array([0.0, 0.0]))
+    state = state.replace(pipeline_state=jax.jit(env.state_on)(scene))
+    total, step = 0.0, jax.jit(env.step)
+    for _ in range(70):
+        state = step(state, jnp.ones(2))
+        total += float(state.reward)
+        if state.done:
+            break
+    assert int(state.pipeline_state.outcome) == Outcome.SUCCESS
+    assert float(state.metrics["outcome/success"]) == 1.0
+    left = float(jnp.linalg.norm(state.pipeline_state.physics.qpos[:2]))
+    assert total == pytest.approx(100 * (12.0 - left), abs=0.05)
+    assert 0.95 < left < 1.0
+    assert float(state.pipeline_state.episode_return) == pytest.approx(total, abs=0.05)
+    assert float(state.pipeline_state.path_length_m) == pytest.approx(12.0 - left, abs=0.01)
+
+
+def test_automatic_reset_draws_a_fresh_scene_and_leaves_the_others_alone():
+    env = make("state", max_decisions=3)
+    batch = BatchEnv(env, 4)
+    state = jax.jit(batch.reset)(jax.random.key(4))
+    step = jax.jit(batch.step)
+    goals = [np.asarray(state.rover.scene.goal_xy_m)]
+    for i in range(6):
+        state, result = step(state, jnp.full((4, 2), 0.5))
+        goals.append(np.asarray(state.rover.scene.goal_xy_m))
+        ended = i % 3 == 2
+        assert np.all(np.asarray(result.truncated) == ended)
+        assert np.all(np.asarray(state.is_first) == ended)
+    assert np.array_equal(goals[0], goals[2])
+    assert len({tuple(g) for at in (0, 3, 6) for g in goals[at].tolist()}) == 12
+    assert np.all(np.asarray(state.rover.num_decisions) == 0)
+
+
+def test_truncation_is_told_apart_from_termination():
+    env = make("state", max_decisions=1)
+    state = jax.jit(env.step)(jax.jit(env.reset)(jax.random.key(5)), jnp.ones(2))
+    assert float(state.done) == 1.0
+    assert float(state.info["truncation"]) == 1.0
+    assert float(state.metrics["reward/timeout"]) == -20.0
+
+
+def test_state_observation_says_where_the_goal_is():
+    env = make("state")
+    rover = jax.jit(env.initial_state)(jax.random.key(6))
+    seen = np.asarray(jax.jit(env.observe)(rover))
+    offset = np.asarray(rover.scene.goal_xy_m - rover.physics.qpos[:2])
+    np.testing.assert_allclose(seen[:2] * 16.0, offset, atol=1e-4)  # facing along x: the rover's frame is the world's
+    np.testing.assert_allclose(seen[2:4], [0, 1], atol=1e-6)
+    turned = rover.replace(physics=env.engine.place(rover.physics.qpos[:2], jnp.float32(np.pi / 2)))
+    left = np.asarray(jax.jit(env.observe)(turned))
+    np.testing.assert_allclose(left[:2] * 16.0, [offset[1], -offset[0]], atol=1e-4)
+
+
+def test_diverged_physics_never_reaches_the_observation():
+    env = make("state")
+    rover = jax.jit(env.initial_state)(jax.random.key(7))
+    broken = rover.replace(physics=rover.physics.replace(qvel=rover.physics.qvel.at[0].set(1e30)))
+    after, result = jax.jit(env.advance)(broken, jnp.ones(2))
+    assert int(after.outcome) == Outcome.UNSTABLE
+    assert float(result.terminated) == 1.0
+    assert np.isfinite(float(result.reward))
+    assert np.isfinite(np.asarray(after.physics.qpos)).all()
+
+
+def test_mujoco_sees_the_same_state():
+    env = make()
+    step = jax.jit(env.step)
+    state = jax.jit(env.reset)(jax.random.key(8))
+    for _ in range(5):
+        state = step(state, jnp.array([0.6, 1.0]))
+    data = env.to_mujoco(state)
+    assert isinstance(env.mj_model, mujoco.MjModel)
+    rover = state.pipeline_state
+    np.testing.assert_allclose(data.body("rover").xpos, rover.physics.qpos[:3], atol=1e-6)
+    np.testing.assert_allclose(data.body("goal").xpos[:2], rover.scene.goal_xy_m, atol=1e-6)
+    for xy, shape in zip(rover.scene.rock_xy_m, rover.scene.rock_shape, strict=True):
+        np.testing.assert_allclose(data.body(f"rock{int(shape)}").xpos[:2], xy, atol=1e-6)
+    names = [env.mj_model.geom(i).name for i in range(env.mj_model.ngeom)]
+    assert all(name.startswith(("ground", "rock", "goal", "rover")) or not name for name in names)
+    assert env.mj_model.camera("d435").fovy[0] == pytest.approx(42.56, abs=0.01)
+
+
+def test_same_key_same_episode():
+    env = make()
+
+    def episode():
+        state = jax.jit(env.reset)(jax.random.key(9))
+        step = jax.jit(env.step)
+        for i in range(4):
+            state = step(state, jnp.array([1.0, 0.2 * i]))
+        return jax.device_get((state.obs, state.reward, state.pipeline_state.physics.qpos))
+
+    jax.tree.map(np.testing.assert_array_equal, episode(), episode())
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"obs": "sonar"}, "env.obs = 'sonar'.*segmentation, rgb, state"),
+        ({"physics": "bullet"}, "engine = 'bullet'.*native"),
+        ({"renderer": "crayon"}, "renderer = 'crayon'.*scanline"),
+        ({"scale": -3}, "scale = -3.*1 or more"),
+        ({"scale": 400}, "scale = 400.*at least 4 pixels"),
+        ({"goal_radius": 3.0}, "goal_radius: no such setting.*goal_radius_m"),
+        ({"num_rocks": "many"}, "num_rocks = 'many'.*whole number"),
+    ],
+)
+def test_a_wrong_setting_is_refused_with_its_name_and_what_would_be_right(fields, says):
+    with pytest.raises(ConfigError, match=says):
+        segvisrl_jax.make_env(**fields)

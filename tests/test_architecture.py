@@ -1,0 +1,72 @@
+"""Imports point one way, and importing the package is quick and touches no device."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import segvisrl_jax
+
+PACKAGE = Path(segvisrl_jax.__file__).parent
+MAY_IMPORT = {  # part -> the parts it may import, besides itself
+    "assets": set(),
+    "config": set(),
+    "types": set(),
+    "env": {"assets", "config", "types", "vision"},  # vision only from rover_env: see below
+    "vision": {"assets", "config", "types", "env"},  # env only its data: see below
+    "agent": {"config", "types"},
+    "training": {"assets", "config", "types", "env", "vision", "agent"},
+    "report": {"config", "types", "env", "vision", "training"},
+    "commands": {"assets", "config", "types", "env", "vision", "agent", "training", "report", "cli"},
+    "cli": {"config", "commands"},
+    "__init__": {"config", "env", "vision", "training"},
+}
+ENV_DATA = {"env.model", "env.rocks", "env.scene", "env.pose"}
+
+
+def imported_names(path: Path) -> set[str]:
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return {name.removeprefix("segvisrl_jax.") for name in names if name.startswith("segvisrl_jax.")}
+
+
+def files() -> list[Path]:
+    return sorted(PACKAGE.rglob("*.py"))
+
+
+def part_of(path: Path) -> str:
+    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+def test_every_import_points_down():
+    assert len(files()) > 20
+    for path in files():
+        part = part_of(path)
+        found = {name.split(".")[0] for name in imported_names(path)} - {part}
+        unknown = found - MAY_IMPORT[part] - {name for name in found if part == "__init__"}
+        assert not unknown, f"{path.relative_to(PACKAGE)} imports {unknown}"
+
+
+def test_vision_reads_only_the_environments_data_and_only_rover_env_sees():
+    for path in files():
+        names = imported_names(path)
+        if part_of(path) == "vision":
+            from_env = {".".join(name.split(".")[:2]) for name in names if name.startswith("env.")}
+            assert from_env <= ENV_DATA, f"{path.name} imports {from_env - ENV_DATA}"
+        if part_of(path) == "env" and path.name != "rover_env.py":
+            assert not {name for name in names if name.startswith("vision")}, path.name
+
+
+def test_importing_the_package_loads_neither_jax_nor_mujoco():
+    code = "import sys, segvisrl_jax, segvisrl_jax.config, segvisrl_jax.cli; print([m for m in ('jax', 'mujoco', 'brax') if m in sys.modules])"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert said.stdout.strip() == "[]"
+
+
+def test_public_names_exist():
+    for name in segvisrl_jax.__all__:
+        assert getattr(segvisrl_jax, name) is not None

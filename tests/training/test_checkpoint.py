@@ -1,0 +1,75 @@
+"""Checkpoints and policies come back bit by bit; what is damaged is named."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from segvisrl_jax.config import ConfigError, from_dict, preset_config, to_dict
+from segvisrl_jax.config import TrainConfig
+from segvisrl_jax.training.checkpoint import Checkpoints, load_policy, save_policy
+
+
+def state():
+    return {"params": {"w": jnp.arange(6.0).reshape(2, 3) / 3}, "key": jax.random.split(jax.random.key(3), 2), "n": jnp.int32(7)}
+
+
+def test_checkpoints_come_back_bit_by_bit(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    for updates in (1, 2, 3):
+        checkpoints.save(updates, state(), {"seconds": 1.5, "recent": [[1, 2.5, 3]]})
+    assert checkpoints.latest == 3
+    found, host = checkpoints.restore(3, state())
+    assert host == {"seconds": 1.5, "recent": [[1, 2.5, 3]]}
+    np.testing.assert_array_equal(found["params"]["w"], state()["params"]["w"])
+    np.testing.assert_array_equal(jax.random.key_data(found["key"]), jax.random.key_data(state()["key"]))
+    assert jax.random.uniform(found["key"][0]) == jax.random.uniform(state()["key"][0])
+    checkpoints.close()
+
+
+def test_a_checkpoint_of_another_shape_is_refused(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, state(), {})
+    other = {**state(), "params": {"v": jnp.zeros(5)}}
+    with pytest.raises(ConfigError, match="does not fit"):
+        checkpoints.restore(1, other)
+    checkpoints.close()
+
+
+def test_policies_come_back_bit_by_bit(tmp_path):
+    config = preset_config("cnn_lstm", "cpu")
+    params = {"params": {"body": {"kernel": np.random.default_rng(0).normal(size=(3, 3)).astype(np.float32)}, "log_std": np.zeros(2, np.float32)}}
+    save_policy(tmp_path / "policy", config, params, {"success": 0.5})
+    stored, found, scores = load_policy(tmp_path / "policy")
+    assert stored == config
+    assert scores == {"success": 0.5}
+    jax.tree.map(np.testing.assert_array_equal, found, params)
+
+
+@pytest.mark.parametrize("name", ["policy.json", "params.npz"])
+@pytest.mark.parametrize("damage", ["empty", "truncated", "missing", "garbage"])
+def test_a_damaged_policy_is_named(name, damage, tmp_path):
+    params = {"params": {"w": np.arange(1000, dtype=np.float32)}}
+    save_policy(tmp_path, preset_config("mlp", "cpu"), params, {})
+    file = tmp_path / name
+    whole = file.read_bytes()
+    if damage == "missing":
+        file.unlink()
+    else:
+        file.write_bytes({"empty": b"", "truncated": whole[: len(whole) // 2], "garbage": b"\x80\x04x."}[damage])
+    with pytest.raises(ConfigError, match=name if name == "params.npz" or damage != "missing" else "policy"):
+        load_policy(tmp_path)
+
+
+def test_an_unknown_policy_is_answered_with_those_there_are():
+    with pytest.raises(ConfigError, match="should be a folder with policy.json"):
+        load_policy("no_such_policy")
+
+
+@pytest.mark.parametrize("arch", ["cnn_lstm", "cnn", "cnn_lstm_raw", "mlp"])
+@pytest.mark.parametrize("preset", ["paper", "cpu", "gpu", "smoke"])
+def test_settings_survive_json(arch, preset):
+    config = preset_config(arch, preset)
+    assert from_dict(TrainConfig, json.loads(json.dumps(to_dict(config)))) == config

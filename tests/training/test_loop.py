@@ -1,0 +1,137 @@
+"""Training runs end to end, leaves its files, and goes on bit by bit where it stopped."""
+
+import json
+import signal
+
+import jax
+import numpy as np
+import pytest
+
+from segvisrl_jax.config import ConfigError, preset_config, replace_fields
+from segvisrl_jax.training import loop
+from segvisrl_jax.training.checkpoint import Checkpoints, load_policy
+from segvisrl_jax.training.metrics import read_metrics
+
+TINY = {"num_envs": 4, "unroll_length": 8, "num_minibatches": 2, "num_epochs": 2, "episodes": 4, "num_slots": 4}
+TINY_NETWORK = {"channels": (4, 4), "blocks_per_stage": 1, "feature_size": 16, "lstm_size": 8}
+QUIET = {"say": lambda line: None}
+
+
+def tiny(arch, runs_dir, updates, **fields):
+    steps = updates * 32
+    named = {**TINY, **TINY_NETWORK, "steps": steps, "scale": 120.0, "engine": "native"}
+    named |= {"every_decisions": 64, "checkpoint_every_updates": 2, "runs_dir": str(runs_dir), **fields}
+    return replace_fields(preset_config(arch, "smoke"), **named)
+
+
+def final_state(config):
+    trainer = loop.Trainer(config)
+    checkpoints = Checkpoints(loop.Path(config.runs_dir) / config.run_name)
+    state, host = checkpoints.restore(checkpoints.latest, trainer.start())
+    checkpoints.close()
+    return state, host
+
+
+def as_arrays(tree):
+    return [np.asarray(jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key) else x) for x in jax.tree.leaves(tree)]
+
+
+@pytest.mark.parametrize("arch", ["cnn_lstm", "mlp"])
+def test_stopping_and_going_on_changes_no_bit(arch, tmp_path):
+    whole = tiny(arch, tmp_path, updates=4, run="whole")
+    assert loop.train(whole, **QUIET).finished
+    # the same run, stopped after two updates: the schedule is that of four
+    first = tiny(arch, tmp_path, updates=4, run="parts")
+    stopped = stop_after(first, updates=2)
+    assert not stopped.finished
+    assert stopped.decisions == 64
+    resumed = loop.train(replace_fields(first, resume=True), **QUIET)
+    assert resumed.finished
+
+    (state, host), (other, other_host) = final_state(whole), final_state(first)
+    for a, b in zip(as_arrays(state), as_arrays(other), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert host["recent"] == other_host["recent"]
+    assert host["best"] == other_host["best"]
+    lines, others = (read_metrics(tmp_path / name) for name in ("whole", "parts"))
+    assert [line["step"] for line in others] == [32, 64, 96, 128]
+    for a, b in zip(lines, others, strict=True):
+        assert {k: v for k, v in a.items() if "time/" not in k} == {k: v for k, v in b.items() if "time/" not in k}
+
+
+def stop_after(config, updates):
+    """Trains and sends itself the signal of Ctrl-C once ``updates`` updates are done."""
+    original = loop.Trainer.update
+    count = 0
+
+    def update(self, state):
+        nonlocal count
+        count += 1
+        if count == updates:
+            signal.raise_signal(signal.SIGINT)
+        return original(self, state)
+
+    loop.Trainer.update = update
+    try:
+        return loop.train(config, **QUIET)
+    finally:
+        loop.Trainer.update = original
+
+
+def test_a_run_leaves_its_files(tmp_path):
+    config = tiny("mlp", tmp_path, updates=2, run="run")
+    result = loop.train(config, **QUIET)
+    assert result.decisions == 64
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["ppo"]["num_envs"] == 4
+    lines = read_metrics(tmp_path / "run")
+    assert {"ppo/entropy", "ppo/explained_variance", "time/decisions_per_second"} <= set(lines[0])
+    assert {"evaluation/success", "evaluation/success_low", "evaluation/success_high"} <= set(lines[-1])
+    assert list((tmp_path / "run" / "tensorboard").glob("events.*"))
+    stored, params, scores = load_policy(tmp_path / "run" / "policy")
+    assert stored == config
+    assert scores["episodes"] == 4
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
+
+
+def test_an_existing_run_is_not_overwritten(tmp_path):
+    config = tiny("mlp", tmp_path, updates=1, run="run")
+    loop.train(config, **QUIET)
+    before = (tmp_path / "run" / "metrics.jsonl").read_bytes()
+    with pytest.raises(ConfigError, match="exists already.*--resume"):
+        loop.train(config, **QUIET)
+    assert (tmp_path / "run" / "metrics.jsonl").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"num_rocks": 5}, "num_rocks.* = 5.*should be 4"),
+        ({"learning_rate": 0.5}, "learning_rate = 0.5"),
+        ({"seed": 9}, "seed = 9.*should be 0"),
+    ],
+)
+def test_a_run_goes_on_only_as_itself(change, says, tmp_path):
+    config = tiny("mlp", tmp_path, updates=1, run="run")
+    loop.train(config, **QUIET)
+    with pytest.raises(ConfigError, match=says):
+        loop.train(replace_fields(config, resume=True, steps=64, **change), **QUIET)
+
+
+def test_nothing_to_resume_is_said(tmp_path):
+    with pytest.raises(ConfigError, match="no checkpoint to resume"):
+        loop.train(tiny("mlp", tmp_path, updates=1, run="none", resume=True), **QUIET)
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_checkpoint_of_another_architecture_is_refused(tmp_path):
+    config = tiny("mlp", tmp_path, updates=1, run="run")
+    loop.train(config, **QUIET)
+    other = replace_fields(preset_config("cnn", "smoke"), runs_dir=str(tmp_path), run="run", resume=True)
+    with pytest.raises(ConfigError, match=r"arch = 'cnn': should be 'mlp'"):
+        loop.train(other, **QUIET)
+
+
+def test_evaluation_starts_as_the_paper_does_whatever_training_does():
+    config = preset_config("cnn_lstm", "cpu")
+    assert config.env.scene.random_start_yaw_share > 0
+    assert loop.held_out_env(config.env).scene.random_start_yaw_share == 0
