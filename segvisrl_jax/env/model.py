@@ -164,8 +164,8 @@ def _add_solid(
     """Adds one solid of a library as a mesh on a mocap body, parked out of sight.
 
     Every corner of every face is a vertex of its own with the face's normal, so that faces are
-    drawn flat (shared vertices would share normals). MuJoCo moves a mesh into its inertial frame and
-    the geom back by as much, so what is drawn stands exactly where the library says.
+    drawn flat (shared vertices would share normals). MuJoCo moves a mesh into its inertial frame
+    and the geom back by as much, so what is drawn stands exactly where the library says.
     """
     corners = library.vertices_m[index][library.faces[index, : library.num_faces[index]]]
     corners = corners.astype(np.float64)

@@ -83,9 +83,13 @@ class Trainer:
     def update(self, state: TrainingState) -> tuple[TrainingState, dict[str, Any], EpisodeLog]:
         """One rollout and one learning update."""
         next_key, key = jax.random.split(state.update_key)
-        actor, trajectory, last_value, log = self._unroll(state.learner.params, state.actor)
+        actor, trajectory, last_value, log = self.act(state)
         learner, metrics = self.learner.update(state.learner, trajectory, last_value, key)
         return TrainingState(learner, actor, next_key), metrics, log
+
+    def act(self, state: TrainingState):
+        """One rollout: see ``rollout.unroll``."""
+        return self._unroll(state.learner.params, state.actor)
 
     def evaluate(self, params: Any) -> dict[str, Any]:
         """The current policy on the validation scenes."""

@@ -62,18 +62,16 @@ class ScanlineRenderer:
         return self._classes(scene, camera)
 
     def _draw_classes(self, scene: Scene, camera: CameraPose) -> UInt8[Array, "rows columns"]:
-        start, end = self._solid_spans(scene, camera)
-        ground_start, ground_end = self._ground_span(camera)
+        layers = self._layers(scene, camera)
         power = self._power(scene, camera)
-        columns = jnp.asarray(self._columns)
-        is_goal = _inside(start[-1], end[-1], columns)
         is_hidden_by_goal = power[:-1] > power[-1]
-        is_ground = _inside(ground_start, ground_end, columns)
-        image = is_ground.astype(jnp.uint8) * np.uint8(SegmentationClass.GROUND)
-        image = jnp.where(is_goal, np.uint8(SegmentationClass.GOAL), image)
-        for rock in range(start.shape[0] - 1):
-            is_rock = _inside(start[rock], end[rock], columns) & ~(is_goal & is_hidden_by_goal[rock])
-            image = jnp.where(is_rock, np.uint8(SegmentationClass.ROCK), image)
+        # Without the barrier, XLA works out every span anew for every pixel in it.
+        layers, is_hidden_by_goal = jax.lax.optimization_barrier((layers, is_hidden_by_goal))
+        ground, *rocks, goal = [self._covers(layer) for layer in layers]
+        image = jnp.where(ground, GROUND, SPACE)
+        image = jnp.where(goal, GOAL, image)
+        for rock, is_behind in zip(rocks, is_hidden_by_goal, strict=True):
+            image = jnp.where(rock & ~(goal & is_behind), ROCK, image)
         return image
 
     def _solid_spans(self, scene: Scene, camera: CameraPose) -> tuple[Array, Array]:

@@ -248,13 +248,13 @@ def test_counts_and_learning_rate() -> None:
 def test_epochs_end_early_once_the_policy_moved_far(execution: str) -> None:
     state, trajectory = rollout("mlp")
     done = {}
-    for kl_stop in (1e-9, 0.0, 1e9):
+    for kl_stop in (1e-9, 1e9):
         config = dataclasses.replace(CONFIG, kl_stop=kl_stop)
         learner = make_learner(built("mlp"), config, TOTAL_UPDATES, execution)
         _, metrics = update(learner, state, trajectory)
         assert metrics["approx_kl"] > 1e-9
         done[kl_stop] = metrics["num_epochs_done"]
-    assert done == {1e-9: 1, 0.0: 3, 1e9: 3}
+    assert done == {1e-9: 1, 1e9: 3}
 
 
 @pytest.mark.parametrize("limit", [1e-3, 1e6])
