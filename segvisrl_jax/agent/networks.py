@@ -8,7 +8,7 @@ Networks know nothing of sampling (distributions.py) nor of learning (ppo.py).
 import functools
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import flax.linen as nn
 import jax
@@ -253,8 +253,8 @@ class Network:
         return jnp.uint8 if self.has_convolutions else jnp.float32
 
 
-def make_network(arch: Arch, config: NetworkConfig, observation_shape: tuple[int, ...]) -> Network:
-    """The network of an architecture for observations of one shape, without batch axes.
+def make_network(arch: str, config: NetworkConfig, observation_shape: tuple[int, ...]) -> Network:
+    """The network of a ``config.Arch`` for observations of one shape, without batch axes.
 
     Raises:
         ConfigError: for an unknown architecture, or a shape that it cannot read.
@@ -264,7 +264,7 @@ def make_network(arch: Arch, config: NetworkConfig, observation_shape: tuple[int
     rank, axes = (1, "(size,)") if arch == "mlp" else (3, "(rows, columns, channels)")
     good = len(observation_shape) == rank and all(size >= 1 for size in observation_shape)
     require(good, "observation_shape", observation_shape, f"{axes} for arch {arch!r}")
-    return Network(ActorCritic(arch, config), tuple(observation_shape))
+    return Network(ActorCritic(cast(Arch, arch), config), tuple(observation_shape))
 
 
 def _make_body(arch: Arch, config: NetworkConfig) -> MLP | ImpalaCNN:

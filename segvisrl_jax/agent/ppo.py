@@ -9,7 +9,7 @@ acting is not here (training/rollout.py).
 import dataclasses
 import functools
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, cast
 
 import jax
 import jax.numpy as jnp
@@ -254,7 +254,7 @@ def make_learner(
     network: Network,
     config: PPOConfig,
     total_updates: int,
-    execution: Execution = "auto",
+    execution: str = "auto",
     chunk: int | None = None,
 ) -> Learner:
     """The learner of a network.
@@ -282,12 +282,13 @@ def make_learner(
     require(divides, "chunk", chunk, should)
     if execution == "auto":
         execution = "host" if on_cpu and network.has_convolutions else "fused"
+    kind = cast(Literal["host", "fused"], execution)
     schedule = learning_rate_schedule(config, total_updates)
     optimizer = optax.chain(
         optax.clip_by_global_norm(config.max_gradient_norm),
         optax.adam(schedule, eps=ADAM_EPSILON),
     )
-    return Learner(network, config, schedule, optimizer, execution, chunk)
+    return Learner(network, config, schedule, optimizer, kind, chunk)
 
 
 def _start_progress(state: LearnerState) -> Progress:

@@ -76,7 +76,7 @@ class Trainer:
         """The state before the first update."""
         keys = jax.random.split(jax.random.key(self.config.seed), 3)
         params_key, act_key, update_key = keys
-        learner = self.learner.init(params_key)
+        learner = jax.jit(self.learner.init)(params_key)
         actor = jax.jit(lambda key: start_acting(key, self.batch, self.network))(act_key)
         return TrainingState(learner, actor, update_key)
 

@@ -49,7 +49,7 @@ def steps_per_judgement(config: EnvConfig) -> int:
 
 
 def rest_height_m(model: mujoco.MjModel) -> float:
-    """Height of the rover's origin at rest on the ground, into which the wheels sink by 0.6 mm."""
+    """Height of the rover's origin at rest on the ground, into which the wheels sink by 0.2 mm."""
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, nstep=round(SETTLING_TIME_S / model.opt.timestep))
     return float(data.qpos[2])

@@ -91,12 +91,13 @@ class NativeEngine:
 
         MuJoCo's full physics state is time, qpos, qvel; the solver starts cold. At a
         warning ``rollout`` stops stepping that trajectory and repeats its state, which may be
-        finite: its time gives it away. What is not finite to begin with never reaches MuJoCo, which
+        finite: its time gives it away. What is diverged to begin with never reaches MuJoCo, which
         would print a warning every time; ``engine.keep_diverged`` answers for it.
         """
-        finite = np.isfinite(start).all(axis=1) & np.isfinite(control).all(axis=(1, 2))
-        start = np.where(finite[:, None], start, self._rest)
-        control = np.where(finite[:, None, None], control, 0.0)
+        sound = (np.abs(start) < engine.MAX_COORDINATE).all(axis=1)
+        sound &= np.isfinite(control).all(axis=(1, 2))
+        start = np.where(sound[:, None], start, self._rest)
+        control = np.where(sound[:, None, None], control, 0.0)
         full = np.concatenate([np.zeros((len(start), 1)), start], axis=1)
         num_steps = self._stride * self._num_judgements
         with self._lock:

@@ -1,0 +1,70 @@
+"""Convex solids with what drawing needs to know of their faces: planes, and which edge lies between which.
+
+Worked out once, with NumPy, from the plain ``ConvexSolids``. Nothing here is projected or drawn.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float32, Int32
+
+from segvisrl_jax.types import ConvexSolids
+
+NOT_A_FACE_M = 1.0  # plane offset of padding (its normal is zero): never turned to anyone
+
+
+@struct.dataclass
+class Polyhedra:
+    """Convex polyhedra. NumPy arrays when built; ``take`` some of them under jit.
+
+    Padding never draws: a padded edge has the same face on both sides; a padded face is not real and, its
+    plane being ``0 . x = 1``, never turned to the camera or to the sun.
+    """
+
+    vertices_m: Float32[Array, "*N V 3"]
+    edges: Int32[Array, "*N E 2"]  # the vertices at its ends
+    edge_faces: Int32[Array, "*N E 2"]  # the faces on its two sides
+    face_edges: Int32[Array, "*N F 3"]  # the edges around a face
+    face_is_real: Bool[Array, "*N F"]
+    normals: Float32[Array, "*N F 3"]  # outward, unit
+    offsets_m: Float32[Array, "*N F"]  # n . x on a face
+
+    @classmethod
+    def from_solids(cls, solids: ConvexSolids) -> "Polyhedra":
+        """Adds the faces' planes and the neighbourhood of faces and edges."""
+        parts = [_faces_and_sides(solids, index) for index in range(len(solids.num_faces))]
+        return cls(
+            vertices_m=np.asarray(solids.vertices_m, np.float32),
+            edges=np.asarray(solids.edges, np.int32),
+            **{name: np.stack([part[name] for part in parts]) for name in parts[0]},
+        )
+
+    def take(self, index: Int32[Array, "*K"]) -> "Polyhedra":
+        """The polyhedra with these numbers."""
+        return jax.tree.map(lambda array: jnp.asarray(array)[index], self)
+
+
+def _faces_and_sides(solids: ConvexSolids, index: int) -> dict[str, np.ndarray]:
+    """The fields that ``Polyhedra`` adds, for one solid, padded like the library."""
+    vertices, edges = solids.vertices_m[index].astype(np.float64), solids.edges[index]
+    num_faces, max_faces = int(solids.num_faces[index]), solids.faces.shape[1]
+    number = {tuple(edge): e for e, edge in enumerate(edges.tolist()) if edge[0] != edge[1]}
+    edge_faces: list[list[int]] = [[] for _ in edges]
+    face_edges = np.zeros((max_faces, 3), np.int32)
+    normals = np.zeros((max_faces, 3))
+    offsets = np.full(max_faces, NOT_A_FACE_M)
+    for face, (a, b, c) in enumerate(solids.faces[index, :num_faces].tolist()):
+        face_edges[face] = [number[min(pair), max(pair)] for pair in ((a, b), (b, c), (c, a))]
+        for edge in face_edges[face]:
+            edge_faces[edge].append(face)
+        normal = np.cross(vertices[b] - vertices[a], vertices[c] - vertices[a])
+        normals[face] = normal / np.linalg.norm(normal)
+        offsets[face] = normals[face] @ vertices[a]
+    return {
+        "edge_faces": np.array([faces or [0, 0] for faces in edge_faces], np.int32),
+        "face_edges": face_edges,
+        "face_is_real": np.arange(max_faces) < num_faces,
+        "normals": normals.astype(np.float32),
+        "offsets_m": offsets.astype(np.float32),
+    }

@@ -1,0 +1,164 @@
+"""Light and surfaces of the in-graph colour image: the regolith's look and the solids' faces. Pure JAX.
+
+Sunlight is hard and there is no air: a face is as bright as it is turned to the sun, plus a little light
+from the ground all around. Colours and lights are those of mjcf/world.xml, so that images look like
+MuJoCo's; the ground's relief is ours. This file does not know rows, spans or order.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float32, Int32, UInt8
+
+from segvisrl_jax.assets import asset_dir
+from segvisrl_jax.types import CameraPose
+from segvisrl_jax.vision.classes import SegmentationClass
+from segvisrl_jax.vision.polyhedra import Polyhedra
+from segvisrl_jax.vision.projection import Projection, Stand, camera_axes, rotate
+
+RELIEF = ((1.6, 0.05), (0.4, 0.015), (0.1, 0.004))
+"""The ground's unevenness, coarse to fine: (wavelength, height) in metres. Slopes of about one in ten: gently
+rolling regolith. It is light and shade only; the ground's shape is flat."""
+STAIN = 0.06  # how much lighter and darker the ground is where it is high and low, as a share
+FADE_PX = 4.0  # a wave shorter than this many source pixels has faded out: downsampling would alias it
+LOWEST_SLOPE = 1e-4  # least steepness of a ray that meets the ground; flatter ones pass the far plane first
+LEAST_DISTANCE_M = 1e-6  # between the eye and a face's plane; faces seen from the edge have no area
+NEVER_SEEN = 1e9  # inverse depth of faces turned away
+
+
+@dataclasses.dataclass(frozen=True)
+class Surfaces:
+    """Colours in class order (RGB, 0 to 1; space is black), and the light on them. Both lights are grey."""
+
+    colours: Float32[np.ndarray, "4 3"]
+    fill: float
+    sun: float
+
+    @classmethod
+    def from_world(cls) -> "Surfaces":
+        """As in mjcf/world.xml."""
+        spec = mujoco.MjSpec.from_file(str(asset_dir("mjcf") / "world.xml"))
+        colours = np.zeros((len(SegmentationClass), 3), np.float32)
+        for kind in (SegmentationClass.GROUND, SegmentationClass.ROCK, SegmentationClass.GOAL):
+            colours[kind] = spec.material(kind.name.lower()).rgba[:3]
+        fill = float(np.mean(spec.visual.headlight.ambient))
+        return cls(colours, fill, float(np.mean(spec.light("sun").diffuse)))
+
+    def paint(
+        self, light: Float32[Array, "rows columns"], kind: UInt8[Array, "rows columns"]
+    ) -> UInt8[Array, "rows columns 3"]:
+        """Colour from brightness and class."""
+        planes = []
+        for channel in range(3):
+            colour = jnp.zeros_like(light)
+            for number, value in enumerate(self.colours[:, channel]):
+                colour = jnp.where(kind == number, value, colour)
+            planes.append(jnp.round(255.0 * jnp.clip(colour * light, 0.0, 1.0)).astype(jnp.uint8))
+        return jnp.stack(planes, axis=-1)
+
+
+def ground_light(
+    u_px: Float32[Array, "columns"],
+    v_px: Float32[Array, "rows"],
+    camera: CameraPose,
+    sun_direction: Float32[Array, "3"],
+    projection: Projection,
+) -> tuple[Float32[Array, "rows columns"], Float32[Array, "rows columns"]]:
+    """(how much sun falls on the ground, how light its surface is), where each pixel's ray meets it."""
+    axes = camera_axes(camera)
+    across = (u_px - projection.width_px / 2) / projection.focal_px
+    down = (v_px - projection.height_px / 2) / projection.focal_px
+    x, y, z = (
+        axes[0, k] * across[None] + (axes[1, k] * down + axes[2, k])[:, None] for k in range(3)
+    )
+    depth = camera.position_m[2] / jnp.maximum(-z, LOWEST_SLOPE)
+    x, y = camera.position_m[0] + depth * x, camera.position_m[1] + depth * y
+    # One pixel's footprint along the line of sight, which is its longer side.
+    footprint = depth**2 / (projection.focal_px * jnp.maximum(camera.position_m[2], LOWEST_SLOPE))
+    height, slope_x, slope_y = jnp.zeros_like(x), jnp.zeros_like(x), jnp.zeros_like(x)
+    for number, (wavelength, amplitude) in enumerate(RELIEF):
+        waves = _waves(x / wavelength, y / wavelength, number)
+        strength = jnp.clip(2.0 - 2.0 * FADE_PX * footprint / wavelength, 0.0, 1.0)
+        height += strength * waves[0] / len(RELIEF)
+        slope_x += strength * waves[1] * (amplitude / wavelength)
+        slope_y += strength * waves[2] * (amplitude / wavelength)
+    sun = sun_direction[2] - slope_x * sun_direction[0] - slope_y * sun_direction[1]
+    return jnp.maximum(sun, 0.0) * (sun_direction[2] > 0.0), 1.0 + STAIN * height
+
+
+def _waves(x: Array, y: Array, seed: int) -> tuple[Array, Array, Array]:
+    """Smooth noise in [-1, 1] with a random value at every whole (x, y), and its two derivatives."""
+    cell_x, cell_y = jnp.floor(x), jnp.floor(y)
+    in_x, in_y = x - cell_x, y - cell_y
+    i, j = cell_x.astype(jnp.int32), cell_y.astype(jnp.int32)
+    a, b = _scatter(i, j, seed), _scatter(i + 1, j, seed)
+    c, d = _scatter(i, j + 1, seed), _scatter(i + 1, j + 1, seed)
+    ease_x, ease_y = in_x * in_x * (3.0 - 2.0 * in_x), in_y * in_y * (3.0 - 2.0 * in_y)
+    rate_x, rate_y = 6.0 * in_x * (1.0 - in_x), 6.0 * in_y * (1.0 - in_y)
+    twist = a - b - c + d
+    value = a + (b - a) * ease_x + (c - a + twist * ease_x) * ease_y
+    return value, rate_x * (b - a + twist * ease_y), rate_y * (c - a + twist * ease_x)
+
+
+def _scatter(i: Int32[Array, "*P"], j: Int32[Array, "*P"], seed: int) -> Float32[Array, "*P"]:
+    """A number in [-1, 1) for every lattice point: multiply by large odd numbers, fold high bits down."""
+    bits = i.astype(jnp.uint32) * np.uint32(0x9E3779B1) + j.astype(jnp.uint32) * np.uint32(0x85EBCA77)
+    bits = (bits + np.uint32(seed * 0x27D4EB2F % 2**32)) * np.uint32(0xC2B2AE3D)
+    bits = (bits ^ (bits >> 15)) * np.uint32(0x85EBCA6B)
+    return (bits >> 8).astype(jnp.float32) * np.float32(2**-23) - 1.0
+
+
+@struct.dataclass
+class Faces:
+    """The faces of one solid as a camera sees them: inverse depth = along_u u + along_v v + at_origin."""
+
+    along_u: Float32[Array, "*N F"]
+    along_v: Float32[Array, "*N F"]
+    at_origin: Float32[Array, "*N F"]
+    sun: Float32[Array, "*N F"]  # how much sun falls on it
+
+
+def faces(
+    solid: Polyhedra,
+    stand: Stand,
+    sun_direction: Float32[Array, "3"],
+    camera: CameraPose,
+    projection: Projection,
+) -> Faces:
+    """One solid's faces (no leading axis; vmap over more)."""
+    behind = solid.offsets_m - rotate(solid.normals, stand.camera_in_solid_m())
+    is_seen = behind < -LEAST_DISTANCE_M
+    normals = rotate(camera_axes(camera), rotate(stand.turn, solid.normals))
+    plane = normals / jnp.where(is_seen, behind, -1.0)[:, None]
+    across, down = projection.width_px / 2, projection.height_px / 2
+    along_u, along_v = plane[:, 0] / projection.focal_px, plane[:, 1] / projection.focal_px
+    at_origin = plane[:, 2] - along_u * across - along_v * down
+    sun = jnp.maximum(rotate(solid.normals, rotate(stand.turn.T, sun_direction)), 0.0)
+    return Faces(
+        along_u=jnp.where(is_seen, along_u, 0.0),
+        along_v=jnp.where(is_seen, along_v, 0.0),
+        at_origin=jnp.where(is_seen, at_origin, NEVER_SEEN),
+        sun=sun,
+    )
+
+
+def face_light(
+    faces: Faces, u_px: Float32[Array, "columns"], v_px: Float32[Array, "rows"]
+) -> Float32[Array, "rows columns"]:
+    """How much sun falls on the face that each pixel shows, where it shows this solid.
+
+    A ray enters a convex solid through the last of the planes turned to it that it passes.
+    """
+    farthest = jnp.full((v_px.shape[0], u_px.shape[0]), NEVER_SEEN, jnp.float32)
+    light = jnp.zeros_like(farthest)
+    for face in range(faces.sun.shape[0]):
+        in_row = faces.along_v[face] * v_px + faces.at_origin[face]
+        inverse_depth = faces.along_u[face] * u_px[None] + in_row[:, None]
+        is_later = inverse_depth < farthest
+        farthest = jnp.where(is_later, inverse_depth, farthest)
+        light = jnp.where(is_later, faces.sun[face], light)
+    return light
