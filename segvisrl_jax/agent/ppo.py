@@ -205,7 +205,8 @@ class Learner:
         gradient, terms = jax.tree.map(lambda leaf: leaf / num_chunks, total)
         state = progress.state
         norm = optax.tree.norm(gradient)
-        updates, opt_state = self.optimizer.update(gradient, state.opt_state, state.params)
+        with jax.numpy_dtype_promotion("standard"):  # optax multiplies whole numbers by floats
+            updates, opt_state = self.optimizer.update(gradient, state.opt_state, state.params)
         stepped = Progress(
             state=dataclasses.replace(
                 state,
@@ -238,12 +239,14 @@ class Learner:
         state = dataclasses.replace(progress.state, num_updates=progress.state.num_updates + 1)
         count = jnp.maximum(progress.num_applied, 1).astype(jnp.float32)
         means = jax.tree.map(lambda leaf: leaf / count, progress.terms_sum)
+        with jax.numpy_dtype_promotion("standard"):  # optax divides whole numbers
+            learning_rate = jnp.asarray(self.schedule(state.num_gradient_steps), jnp.float32)
         metrics = {field.name: getattr(means, field.name) for field in dataclasses.fields(means)}
         metrics |= {
             "approx_kl": progress.last_kl,
             "explained_variance": explained_variance,
             "gradient_norm": progress.gradient_norm_sum / count,
-            "learning_rate": jnp.asarray(self.schedule(state.num_gradient_steps), jnp.float32),
+            "learning_rate": learning_rate,
             "num_epochs_done": progress.num_epochs_done.astype(jnp.float32),
             "skipped_steps": progress.num_skipped.astype(jnp.float32),
         }

@@ -34,6 +34,11 @@ class Probe(NamedTuple):
     reward: Callable  # (cue, time, action (2,)) -> reward
 
 
+def sign(cue: jax.Array) -> jax.Array:
+    """-1 for cue 0, 1 for cue 1."""
+    return 2.0 * cue.astype(jnp.float32) - 1.0
+
+
 class Situation(NamedTuple):
     """Where B environments stand between two rollouts."""
 
@@ -55,7 +60,9 @@ def drive(network: Network, probe: Probe, params, situation: Situation, key):
         action = policy.sample(key=act_key)
         ends = time == probe.length - 1
         new_cue = jax.random.bernoulli(cue_key, shape=cue.shape).astype(jnp.int32)
-        after = Situation(jnp.where(ends, new_cue, cue), jnp.where(ends, 0, time + 1), carry)
+        after = Situation(
+            jnp.where(ends, new_cue, cue), jnp.where(ends, jnp.zeros_like(time), time + 1), carry
+        )
         rows = (observation, action, policy.log_prob(action), output.value)
         return after, (*rows, reward(cue, time, action), ends.astype(jnp.float32), begins)
 
@@ -115,16 +122,16 @@ def pixel(lit: jax.Array, column: jax.Array) -> jax.Array:
 
 
 def test_a_constant_reward_is_learnt() -> None:
-    probe = Probe(1, lambda cue, time: jnp.ones(1), lambda cue, time, action: 1.0)
+    probe = Probe(1, lambda cue, time: jnp.ones(1), lambda cue, time, action: jnp.ones(()))
     _, value = answers(*train("mlp", probe, 30), probe)
     np.testing.assert_allclose(value, 1.0, atol=0.05)
 
 
 def test_value_depends_on_the_observation() -> None:
     def observe(cue: jax.Array, time: jax.Array) -> jax.Array:
-        return (2.0 * cue - 1.0)[None]
+        return sign(cue)[None]
 
-    probe = Probe(1, observe, lambda cue, time, action: 2.0 * cue - 1.0)
+    probe = Probe(1, observe, lambda cue, time, action: sign(cue))
     _, value = answers(*train("mlp", probe, 30), probe)
     np.testing.assert_allclose(value, [[-1.0, 1.0]], atol=0.1)
 
@@ -144,7 +151,7 @@ def test_the_action_that_pays_most_is_found(arch: str) -> None:
 
     def observe(cue: jax.Array, time: jax.Array) -> jax.Array:
         if arch == "mlp":
-            return (2.0 * cue - 1.0)[None]
+            return sign(cue)[None]
         return pixel(lit=jnp.asarray(True), column=1 + 3 * cue)
 
     def reward(cue: jax.Array, time: jax.Array, action: jax.Array) -> jax.Array:
@@ -161,8 +168,8 @@ RECALL = Probe(
     # The cue is shown at the first step only; then nothing, whatever it was.
     observe=lambda cue, time: pixel(lit=time == 0, column=1 + 3 * cue),
     # At the last step: +1 for a left wheel above half speed after cue 1, or below it after cue 0.
-    reward=lambda cue, time, action: (
-        jnp.where((action[0] > 0.5) == (cue == 1), 1.0, -1.0) * (time == 3)
+    reward=lambda cue, time, action: jnp.where(
+        time < 3, 0.0, jnp.where((action[0] > 0.5) == (cue == 1), 1.0, -1.0)
     ),
 )
 
