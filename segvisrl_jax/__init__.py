@@ -18,7 +18,7 @@ _PUBLIC = {
     "preset_config": "segvisrl_jax.config",
     "train": "segvisrl_jax.training.loop",
 }
-__all__ = sorted(_PUBLIC)  # noqa: PLE0605
+__all__ = sorted(_PUBLIC)
 
 
 def __getattr__(name: str) -> Any:

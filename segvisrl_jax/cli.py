@@ -62,10 +62,11 @@ def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: O
 
     said = io.StringIO()
     words = [_whole_number(word) for word in options]
-    settings = {} if default is None else {"default": default}
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(kind, args=words, prog=f"segvisrl {command}", **settings)
+            if default is None:
+                return tyro.cli(kind, args=words, prog=f"segvisrl {command}")
+            return tyro.cli(kind, args=words, prog=f"segvisrl {command}", default=default)
     except SystemExit as stop:
         if not stop.code:
             raise

@@ -12,7 +12,6 @@ from flax import struct
 from jaxtyping import Array, Float, Float32, Int32, UInt8
 
 
-
 class Outcome(enum.IntEnum):
     """How an episode stands. ``UNSTABLE`` is a physics failure, never a result of driving."""
 

@@ -188,10 +188,8 @@ class ActorCritic(nn.Module):
 
     def _heads(self, features: Float32[Array, "*B F"]) -> PolicyOutput:
         free_mean = self.policy_head(features)
-        if self.config.bounded_mean:
-            mean = MIDDLE_SPEED + HALF_RANGE * jnp.tanh(free_mean)
-        else:
-            mean = MIDDLE_SPEED + free_mean
+        deviation = HALF_RANGE * jnp.tanh(free_mean) if self.config.bounded_mean else free_mean
+        mean = MIDDLE_SPEED + deviation
         log_std = jnp.clip(self.log_std, math.log(MIN_STD), math.log(MAX_STD))
         return PolicyOutput(mean, log_std, self.value_head(features)[..., 0])
 

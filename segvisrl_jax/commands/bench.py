@@ -1,5 +1,6 @@
 """``segvisrl bench``: how fast physics, rendering and learning run on this machine."""
 
+import functools
 import json
 import platform
 import statistics
@@ -10,7 +11,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 from segvisrl_jax.cli import parse
-from segvisrl_jax.config import Arch, ConfigError, EngineName, PresetName, RendererName, preset_config, replace_fields, require
+from segvisrl_jax.config import (
+    Arch,
+    ConfigError,
+    EngineName,
+    PresetName,
+    RendererName,
+    preset_config,
+    replace_fields,
+    require,
+)
 
 Part = Literal["physics", "render", "train"]
 
@@ -80,9 +90,15 @@ def _physics(asked: BenchOptions):
         batch = BatchEnv(env, asked.batch)
         state = jax.jit(batch.reset)(jax.random.key(0))
         step, action = jax.jit(batch.step), jnp.full((asked.batch, 2), 0.7)
-        compile_s, seconds = _time(lambda s=step, st=state, a=action: s(st, a), asked.repeats)
+        compile_s, seconds = _time(functools.partial(step, state, action), asked.repeats)
         rate = asked.batch / seconds
-        yield {"name": engine, "batch": asked.batch, "decisions_per_s": rate, "mujoco_steps_per_s": rate * steps, "compile_s": compile_s}
+        yield {
+            "name": engine,
+            "batch": asked.batch,
+            "decisions_per_s": rate,
+            "mujoco_steps_per_s": rate * steps,
+            "compile_s": compile_s,
+        }
 
 
 def _render(asked: BenchOptions):
@@ -96,9 +112,15 @@ def _render(asked: BenchOptions):
                 continue
             rover = jax.jit(jax.vmap(env.initial_state))(jax.random.split(jax.random.key(0), asked.batch))
             observe = jax.jit(jax.vmap(env.observe))
-            compile_s, seconds = _time(lambda o=observe, r=rover: o(r), asked.repeats)
+            compile_s, seconds = _time(functools.partial(observe, rover), asked.repeats)
             rows, columns, _ = env.observation_shape
-            yield {"name": renderer, "image": f"{columns} x {rows}", "batch": asked.batch, "frames_per_s": asked.batch / seconds, "compile_s": compile_s}
+            yield {
+                "name": renderer,
+                "image": f"{columns} x {rows}",
+                "batch": asked.batch,
+                "frames_per_s": asked.batch / seconds,
+                "compile_s": compile_s,
+            }
 
 
 def _train(asked: BenchOptions):
@@ -110,7 +132,7 @@ def _train(asked: BenchOptions):
     trainer = Trainer(config)
     state = trainer.start()
     images = config.ppo.decisions_per_update * config.ppo.num_epochs
-    actor, trajectory, last_value, _ = trainer.act(state)
+    _, trajectory, last_value, _ = trainer.act(state)
     compile_act, act_s = _time(lambda: trainer.act(state), asked.repeats)
     key = jax.random.key(0)
     compile_learn, learn_s = _time(
@@ -146,5 +168,9 @@ def _time(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
 
 
 def _print_row(row: dict[str, Any]) -> None:
-    shown = [f"{name.replace('_', ' ')} {value:,.1f}" if isinstance(value, float) else str(value) for name, value in row.items() if name != "part"]
+    shown = [
+        f"{name.replace('_', ' ')} {value:,.1f}" if isinstance(value, float) else str(value)
+        for name, value in row.items()
+        if name != "part"
+    ]
     print(f"{row['part']:<8} {'  '.join(shown)}", flush=True)

@@ -118,5 +118,7 @@ def report_line(result: dict[str, Any]) -> str:
     """The result in one line."""
     low, high = result["success_ci95"]
     shares = ", ".join(f"{name} {100 * result[name]:.1f} %" for name in ("collision", "fall", "timeout"))
-    line = f"success {100 * result['success']:.1f} % [{100 * low:.1f}, {100 * high:.1f}], {shares}, SPL {result['spl']:.3f}"
-    return line + (f", unstable {100 * result['unstable']:.2f} %" if result["unstable"] else "")
+    success = f"success {100 * result['success']:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+    return f"{success}, {shares}, SPL {result['spl']:.3f}" + (
+        f", unstable {100 * result['unstable']:.2f} %" if result["unstable"] else ""
+    )

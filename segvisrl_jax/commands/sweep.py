@@ -13,7 +13,19 @@ from typing import Any
 from segvisrl_jax.cli import parse
 from segvisrl_jax.config import Arch, PresetName, preset_config, replace_fields, require
 
-COLUMNS = ("arch", "scale", "seed", "status", "success", "success_low", "success_high", "collision", "timeout", "spl", "decisions_per_second")
+COLUMNS = (
+    "arch",
+    "scale",
+    "seed",
+    "status",
+    "success",
+    "success_low",
+    "success_high",
+    "collision",
+    "timeout",
+    "spl",
+    "decisions_per_second",
+)
 FAILURE = 1
 
 

@@ -72,9 +72,7 @@ def wheel_radius_m(model: mujoco.MjModel) -> float:
     return float(model.geom(f"rover_{WHEEL_NAMES[0]}_contact").size[0])
 
 
-def set_mujoco_state(
-    model: mujoco.MjModel, data: mujoco.MjData, physics: PhysicsState, scene: Scene
-) -> None:
+def set_mujoco_state(model: mujoco.MjModel, data: mujoco.MjData, physics: PhysicsState, scene: Scene) -> None:
     """Puts one state and one scene into the ``MjData`` of a full model, ready to be drawn.
 
     Args:
@@ -158,9 +156,7 @@ def _compile(spec: mujoco.MjSpec, physics: PhysicsConfig) -> mujoco.MjModel:
     return model
 
 
-def _add_solid(
-    spec: mujoco.MjSpec, name: str, material: str, library: ConvexSolids, index: int
-) -> None:
+def _add_solid(spec: mujoco.MjSpec, name: str, material: str, library: ConvexSolids, index: int) -> None:
     """Adds one solid of a library as a mesh on a mocap body, parked out of sight.
 
     Every corner of every face is a vertex of its own with the face's normal, so that faces are

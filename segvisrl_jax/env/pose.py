@@ -41,9 +41,7 @@ def camera_pose(physics: PhysicsState, mount: CameraMount) -> CameraPose:
     return CameraPose(position_m=physics.qpos[..., :3] + offset, rotation=rotation)
 
 
-def _product(
-    left: Float32[Array, "*B 3 3"], right: Float32[Array, "3 k"]
-) -> Float32[Array, "*B 3 k"]:
+def _product(left: Float32[Array, "*B 3 3"], right: Float32[Array, "3 k"]) -> Float32[Array, "*B 3 k"]:
     """In full float32: accelerators may take fewer bits by default, which costs pixels."""
     return jnp.matmul(left, right, precision="highest")
 

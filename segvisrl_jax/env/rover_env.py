@@ -59,11 +59,10 @@ class RoverEnv(Env):
         self.engine = make_engine(config)
         self.rocks = rocks.rock_library(config.scene)
         self._mount = camera_mount(self.mj_model)
-        self._plan = None
+        camera = config.camera
+        self._plan = tap_plan(camera.height_px, camera.width_px, camera.scale)
         self.renderer = None
         if config.obs != "state":
-            camera = config.camera
-            self._plan = tap_plan(camera.height_px, camera.width_px, camera.scale)
             self.renderer = make_renderer(config, self._plan.rows, self._plan.columns)
 
     # brax's contract
@@ -157,9 +156,7 @@ class RoverEnv(Env):
             episode_return=state.episode_return + reward,
         )
         as_float = jnp.float32
-        return rover, StepResult(
-            reward, verdict.terms, terminated.astype(as_float), truncated.astype(as_float)
-        )
+        return rover, StepResult(reward, verdict.terms, terminated.astype(as_float), truncated.astype(as_float))
 
     def observe(self, state: RoverState) -> Observation:
         """What the agent sees now. Unbatched."""
@@ -221,8 +218,14 @@ def make_env(
     Raises:
         ConfigError: for a setting that does not exist or cannot be used.
     """
-    named = {"obs": obs, "scale": float(scale) if isinstance(scale, int) else scale}
-    named |= {"renderer": renderer, "engine": physics, "num_rocks": num_rocks}
+    scale = float(scale) if isinstance(scale, int) else scale
+    named: dict[str, Any] = {
+        "obs": obs,
+        "scale": scale,
+        "renderer": renderer,
+        "engine": physics,
+        "num_rocks": num_rocks,
+    }
     return RoverEnv(replace_fields(EnvConfig(), **named, **fields))
 
 

@@ -70,9 +70,7 @@ def judge(
     )
 
 
-def outcome_at_instants(
-    track: Track, scene: Scene, task: TaskConfig, rules: SceneConfig
-) -> Int32[Array, "J"]:
+def outcome_at_instants(track: Track, scene: Scene, task: TaskConfig, rules: SceneConfig) -> Int32[Array, "J"]:
     """The outcome that holds at each judged instant, by itself (``RUNNING`` where none does)."""
     goal_distance = jnp.linalg.norm(track.xy_m - scene.goal_xy_m, axis=-1)
     is_success = goal_distance < task.goal_radius_m

@@ -90,7 +90,7 @@ class BatchEnv:
     def _reset_where(self, done: Array, state: BatchState) -> BatchState:
         fresh, next_keys = jax.vmap(self._fresh)(state.key)
         rover = select(done, fresh, state.rover)
-        return state.replace(rover=rover, key=jnp.where(done, next_keys, state.key))
+        return dataclasses.replace(state, rover=rover, key=jnp.where(done, next_keys, state.key))
 
 
 def select(where: Array, chosen, other):

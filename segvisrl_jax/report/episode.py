@@ -44,9 +44,7 @@ class Episode:
         return np.asarray(self.states.physics.qpos[:, :2])
 
 
-def drive_episode(
-    env: RoverEnv, policy: Policy, params: Any, stream: PRNGKeyArray, episode: int = 0
-) -> Episode:
+def drive_episode(env: RoverEnv, policy: Policy, params: Any, stream: PRNGKeyArray, episode: int = 0) -> Episode:
     """Drives one numbered scene of a stream to its end: the same one as ``Evaluator.run`` with that number."""
 
     @jax.jit
@@ -71,14 +69,10 @@ def drive_episode(
     return Episode(stacked, np.stack(seen_images) if seen_images[0].ndim == 3 else None)
 
 
-def episode_frames(
-    env: RoverEnv, episode: Episode, title: str = ""
-) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+def episode_frames(env: RoverEnv, episode: Episode, title: str = "") -> Iterator[UInt8[np.ndarray, "H W 3"]]:
     """The frames of an episode's video, one a decision, the last one held."""
     view = _view_config(env.config)
-    segmented, coloured = (
-        _camera_view(env, replace_fields(view, obs=kind)) for kind in ("segmentation", "rgb")
-    )
+    segmented, coloured = (_camera_view(env, replace_fields(view, obs=kind)) for kind in ("segmentation", "rgb"))
     scene = scene_map(env, episode)
     last = len(episode.xy_m) - 1
     for step in range(last + 1):

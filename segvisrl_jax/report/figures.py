@@ -19,9 +19,7 @@ from segvisrl_jax.config import require
 from segvisrl_jax.training.metrics import METRICS_FILE, STEP_KEY, read_metrics
 
 DOTS_PER_INCH = 100  # so a figure of 10 inches is 1000 pixels wide
-SMOOTHED_SHARE = (
-    0.02  # of a run: the window of the running mean that is drawn over the single updates
-)
+SMOOTHED_SHARE = 0.02  # of a run: the window of the running mean that is drawn over the single updates
 FAILURES = (  # what an episode that did not succeed ended with: key, label, colour
     ("episode/collision", "collision", "#d55e00"),
     ("episode/fall", "fall", "#cc79a7"),
@@ -128,9 +126,7 @@ def _draw_held_out(axes: Axes, run: Run, colour: str, label: str | None) -> None
         return
     at = np.isin(run.columns[STEP_KEY], steps) & np.isfinite(run.columns["evaluation/success"])
     ends = [run.columns.get(f"evaluation/success_{end}") for end in ("low", "high")]
-    low, high = (
-        rates if end is None else np.where(np.isfinite(end[at]), end[at], rates) for end in ends
-    )
+    low, high = (rates if end is None else np.where(np.isfinite(end[at]), end[at], rates) for end in ends)
     errors = np.maximum(0.0, np.stack([rates - low, high - rates]))
     axes.errorbar(
         steps,
@@ -173,9 +169,7 @@ def _draw_series(axes: Axes, runs: Sequence[Run], key: str, label: str) -> None:
     _finish(axes)
 
 
-def _draw_line(
-    axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str, label: str | None
-) -> None:
+def _draw_line(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str, label: str | None) -> None:
     """Single updates pale, their running mean strong."""
     axes.plot(steps, values, color=colour, alpha=0.25, lw=0.8)
     axes.plot(steps, running_mean(values), color=colour, lw=1.8, label=label)
@@ -229,22 +223,17 @@ def success_by_scale(rows: Sequence[Mapping[str, Any]], path_png: Path) -> Path:
     axes.set_xticks(scales, [f"{scale:g}" for scale in scales])
     axes.minorticks_off()
     axes.margins(x=0.08)
-    axes.set(
-        xlabel="downsampling per axis", ylabel="success rate on test scenes", ylim=(-0.02, 1.02)
-    )
+    axes.set(xlabel="downsampling per axis", ylabel="success rate on test scenes", ylim=(-0.02, 1.02))
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     _clear_frame(axes)
     axes.legend(loc="lower left")
     return save_figure(figure, path_png)
 
 
-def _draw_sweep(
-    axes: Axes, rows: Sequence[Mapping[str, Any]], arch: str, colour: str, shift: float
-) -> None:
+def _draw_sweep(axes: Axes, rows: Sequence[Mapping[str, Any]], arch: str, colour: str, shift: float) -> None:
     """The runs of one architecture."""
     scale, rate, low, high = (
-        np.array([float(row[key]) for row in rows])
-        for key in ("scale", "success", "success_low", "success_high")
+        np.array([float(row[key]) for row in rows]) for key in ("scale", "success", "success_low", "success_high")
     )
     errors = np.maximum(0.0, np.stack([rate - low, high - rate]))
     axes.errorbar(scale * shift, rate, errors, fmt="o", ms=5, capsize=3, color=colour, mec="white")

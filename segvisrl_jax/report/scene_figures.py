@@ -25,9 +25,7 @@ OUTCOME_MARKERS = {
 }
 
 
-def trajectories(
-    scene: SceneMap, paths: Sequence[DrivenPath], path_png: Path, title: str = ""
-) -> Path:
+def trajectories(scene: SceneMap, paths: Sequence[DrivenPath], path_png: Path, title: str = "") -> Path:
     """Draws one scene from above, and where rovers drove in it.
 
     Args:
@@ -46,9 +44,7 @@ def trajectories(
         size = 15 if marker == "*" else 10
         end = path.xy_m[-1]
         axes.plot(*end, marker, color=colour, ms=size, mec="white", mew=1, zorder=6)
-        axes.plot(
-            [], [], marker=marker, ms=size * 0.8, mec="white", color=colour, lw=2, label=label
-        )
+        axes.plot([], [], marker=marker, ms=size * 0.8, mec="white", color=colour, lw=2, label=label)
     reach = scene.map_half_size_m * 1.04
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
     axes.set(xlabel="x, forward from the start [m]", ylabel="y, to the left [m]")
@@ -71,16 +67,10 @@ def _draw_scene(axes: Axes, scene: SceneMap) -> None:
         )
     )
     limit = f"collision, {scene.collision_radius_m:g} m"
-    for index, (centre, radius) in enumerate(
-        zip(scene.rock_xy_m, scene.rock_radius_m, strict=True)
-    ):
+    for index, (centre, radius) in enumerate(zip(scene.rock_xy_m, scene.rock_radius_m, strict=True)):
         first = index == 0
         around = {"fc": "#f0cdb5", "ec": layout.COLLISION, "ls": "--", "zorder": 2}
-        axes.add_patch(
-            Circle(
-                tuple(centre), scene.collision_radius_m, label=limit if first else None, **around
-            )
-        )
+        axes.add_patch(Circle(tuple(centre), scene.collision_radius_m, label=limit if first else None, **around))
         axes.add_patch(
             Circle(
                 tuple(centre),
@@ -119,9 +109,6 @@ def preprocessing(
         axes.imshow(image, interpolation="nearest" if is_small else "antialiased")
         axes.set_title(f"{name}, {columns} x {rows}", fontsize=12)
         axes.set(xticks=[], yticks=[])
-    kinds = [
-        Patch(fc=colour / 255, ec="0.4", label=name)
-        for name, colour in zip(CLASS_NAMES, PALETTE, strict=True)
-    ]
+    kinds = [Patch(fc=colour / 255, ec="0.4", label=name) for name, colour in zip(CLASS_NAMES, PALETTE, strict=True)]
     figure.legend(handles=kinds, loc="outside lower center", ncols=len(kinds), frameon=False)
     return save_figure(figure, path_png)

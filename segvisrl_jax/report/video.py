@@ -78,9 +78,7 @@ def _write_gif(path: Path, frames: Iterable[Frame], fps: float) -> None:
     first.save(path, save_all=True, append_images=images, duration=round(1000 / fps), loop=0)
 
 
-def compose_frame(
-    columns: Sequence[Sequence[Pane]], width_px: int = 1200, title: str = ""
-) -> Frame:
+def compose_frame(columns: Sequence[Sequence[Pane]], width_px: int = 1200, title: str = "") -> Frame:
     """Lays panes out in columns of equal height that fill the frame's width.
 
     Args:
@@ -219,9 +217,7 @@ def _draw_scale_bar(draw: ImageDraw.ImageDraw, view: _View, half_size_m: float) 
     draw.text(middle, f"{length:g} m", layout.ROCK, _font(view.size_px // 40), anchor="mb")
 
 
-def _draw_rover(
-    draw: ImageDraw.ImageDraw, view: _View, xy_m: Float[np.ndarray, "2"], yaw_rad: float
-) -> None:
+def _draw_rover(draw: ImageDraw.ImageDraw, view: _View, xy_m: Float[np.ndarray, "2"], yaw_rad: float) -> None:
     """A rectangle of the rover's size, and a wedge ahead of it."""
     length, width = ROVER_SIZE_M
     cosine, sine = np.cos(yaw_rad), np.sin(yaw_rad)

@@ -24,9 +24,7 @@ class Checkpoints:
     """The checkpoints of one run, by number of updates; the last ones are kept. Writing is atomic (orbax)."""
 
     def __init__(self, run_dir: Path):
-        options = ocp.CheckpointManagerOptions(
-            max_to_keep=CHECKPOINTS_KEPT, enable_async_checkpointing=False
-        )
+        options = ocp.CheckpointManagerOptions(max_to_keep=CHECKPOINTS_KEPT, enable_async_checkpointing=False)
         self._manager = ocp.CheckpointManager((run_dir / "checkpoints").resolve(), options=options)
 
     @property
@@ -38,10 +36,18 @@ class Checkpoints:
         """Writes a pytree of arrays and keys, and JSON data that lives on the host."""
         if updates == self.latest:
             return
-        args = ocp.args.Composite(
-            state=ocp.args.StandardSave(_without_keys(state)), host=ocp.args.JsonSave(host)
-        )
+        args = ocp.args.Composite(state=ocp.args.StandardSave(_without_keys(state)), host=ocp.args.JsonSave(host))
         self._manager.save(updates, args=args)
+
+    def restore_latest(self, like: Any) -> tuple[Any, dict[str, Any]]:
+        """Reads the newest checkpoint; see ``restore``.
+
+        Raises:
+            ConfigError: where there is none, or it does not fit.
+        """
+        if self.latest is None:
+            raise ConfigError(f"{self._manager.directory}: holds no checkpoint; leave --resume out and start again")
+        return self.restore(self.latest, like)
 
     def restore(self, updates: int, like: Any) -> tuple[Any, dict[str, Any]]:
         """Reads a checkpoint into the structure, shapes and dtypes of ``like``.
@@ -50,9 +56,7 @@ class Checkpoints:
             ConfigError: where the checkpoint does not fit, as one of another architecture does not.
         """
         target = jax.tree.map(ocp.utils.to_shape_dtype_struct, _without_keys(like))
-        args = ocp.args.Composite(
-            state=ocp.args.StandardRestore(target), host=ocp.args.JsonRestore()
-        )
+        args = ocp.args.Composite(state=ocp.args.StandardRestore(target), host=ocp.args.JsonRestore())
         try:
             found = self._manager.restore(updates, args=args)
         except (ValueError, KeyError, TypeError, FileNotFoundError) as error:
@@ -86,7 +90,7 @@ def save_policy(folder: Path, config: TrainConfig, params: Any, scores: dict[str
     """Writes a policy folder; an older one of the same name is replaced file by file, each in one move."""
     folder.mkdir(parents=True, exist_ok=True)
     flat = {"/".join(path): np.asarray(leaf) for path, leaf in _leaves(jax.device_get(params))}
-    _replace(folder / "params.npz", lambda file: np.savez(file, **flat))
+    _replace(folder / "params.npz", lambda file: np.savez(file, **flat))  # type: ignore[arg-type]
     card = {"format": POLICY_FORMAT, "config": to_dict(config), "scores": scores}
     text = json.dumps(card, indent=2) + "\n"
     _replace(folder / "policy.json", lambda file: file.write(text.encode()))
@@ -124,9 +128,7 @@ def _find_policy(folder: Path) -> Path:
     if is_bare_name and (shipped / "policy.json").is_file():
         return shipped
     known = sorted(p.parent.name for p in asset_dir("pretrained").glob("*/policy.json"))
-    raise ConfigError(
-        f"policy = {str(folder)!r}: should be a folder with policy.json, or one of {known}"
-    )
+    raise ConfigError(f"policy = {str(folder)!r}: should be a folder with policy.json, or one of {known}")
 
 
 def _leaves(params: dict[str, Any], path: tuple[str, ...] = ()):

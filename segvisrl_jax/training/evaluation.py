@@ -100,19 +100,15 @@ class Evaluator:
         decide = functools.partial(self._decide, params, stream, episodes)
         return jax.lax.scan(decide, slots, keys)
 
-    def _decide(
-        self, params, stream, episodes, slots: Slots, key
-    ) -> tuple[Slots, dict[str, Array]]:
+    def _decide(self, params, stream, episodes, slots: Slots, key) -> tuple[Slots, dict[str, Array]]:
         observation = jax.vmap(self.env.observe)(slots.rover) if self.policy.observes else None
-        carry, action = self.policy.act(
-            params, slots.carry, slots.rover, observation, slots.is_first, key
-        )
+        carry, action = self.policy.act(params, slots.carry, slots.rover, observation, slots.is_first, key)
         is_driving = slots.episode < episodes
         driven, _ = jax.vmap(self.env.advance)(slots.rover, action)
         rover = select(is_driving, driven, slots.rover)
         done = is_driving & (rover.outcome != Outcome.RUNNING)
         ended = _ended(slots.episode, done, rover)
-        after = slots.replace(rover=rover, carry=carry, is_first=jnp.zeros_like(slots.is_first))
+        after = dataclasses.replace(slots, rover=rover, carry=carry, is_first=jnp.zeros_like(slots.is_first))
         refill = functools.partial(self._refill, stream)
         return jax.lax.cond(jnp.any(done), refill, lambda _, s: s, done, after), ended
 
@@ -120,7 +116,8 @@ class Evaluator:
         """Slots whose episode ended take the next numbers."""
         following = slots.next_episode + jnp.cumsum(done, dtype=jnp.int32) - 1
         episode = jnp.where(done, following, slots.episode)
-        return slots.replace(
+        return dataclasses.replace(
+            slots,
             rover=select(done, self._scenes(stream, episode), slots.rover),
             episode=episode,
             next_episode=slots.next_episode + jnp.sum(done, dtype=jnp.int32),

@@ -67,9 +67,7 @@ class Trainer:
         self.learner: Learner = make_learner(self.network, config.ppo, config.num_updates)
         self.batch = BatchEnv(env, config.ppo.num_envs)
         self.policy: Policy = network_policy(self.network, config.arch)
-        self.evaluator = Evaluator(
-            RoverEnv(held_out_env(config.env)), self.policy, config.evaluation.num_slots
-        )
+        self.evaluator = Evaluator(RoverEnv(held_out_env(config.env)), self.policy, config.evaluation.num_slots)
         self._unroll = jax.jit(self._unroll_batch)
 
     def start(self) -> TrainingState:
@@ -119,8 +117,8 @@ def train(config: TrainConfig, say=print) -> TrainResult:
     checkpoints = Checkpoints(run_dir)
     state, host = trainer.start(), HostState()
     if config.resume:
-        found, data = checkpoints.restore(checkpoints.latest, state)
-        state, host = found, HostState(**data)
+        state, data = checkpoints.restore_latest(state)
+        host = HostState(**data)
         say(f"going on from update {host.updates} of {config.num_updates}")
     try:
         with MetricsWriter(run_dir) as writer, StopSignals() as stop:
@@ -206,9 +204,7 @@ def open_run_dir(config: TrainConfig) -> Path:
     config_file = run_dir / "config.json"
     if not config.resume:
         if run_dir.exists() and any(run_dir.iterdir()):
-            raise ConfigError(
-                f"run = {str(run_dir)!r}: exists already; go on with --resume, or choose another --run"
-            )
+            raise ConfigError(f"run = {str(run_dir)!r}: exists already; go on with --resume, or choose another --run")
         run_dir.mkdir(parents=True, exist_ok=True)
         config_file.write_text(json.dumps(to_dict(config), indent=2) + "\n")
         return run_dir
@@ -253,11 +249,11 @@ class StopSignals:
         self.requested = True
 
 
-def _finished_episodes(log: EpisodeLog) -> list[tuple[int, float, int]]:
+def _finished_episodes(log: EpisodeLog) -> list[list[float]]:
     """(outcome, return, decisions) of the episodes that ended, in the order of time."""
     outcome, returns, lengths = jax.device_get((log.outcome, log.episode_return, log.num_decisions))
     ended = np.nonzero(outcome != Outcome.RUNNING)
-    return [(int(outcome[i]), float(returns[i]), int(lengths[i])) for i in zip(*ended, strict=True)]
+    return [[int(outcome[i]), float(returns[i]), int(lengths[i])] for i in zip(*ended, strict=True)]
 
 
 def _row(metrics: dict[str, Any], log: EpisodeLog, recent) -> dict[str, float]:

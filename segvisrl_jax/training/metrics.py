@@ -105,9 +105,7 @@ class MetricsWriter:
             from tensorboardX import SummaryWriter
 
             number = len(list(folder.glob("events.*"))) if folder.exists() else 0
-            self._events = SummaryWriter(
-                str(folder), purge_step=self._purge_step, filename_suffix=f".{number}"
-            )
+            self._events = SummaryWriter(str(folder), purge_step=self._purge_step, filename_suffix=f".{number}")
         return self._events
 
     def _close_events(self) -> None:
@@ -179,9 +177,7 @@ class ProgressDisplay:
         self._console = console or Console()
         self._plain = _PlainLines(self._console, plain_interval_s)
         self._values: dict[str, float] = {}
-        self._bar = Progress(
-            TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[pace]}")
-        )
+        self._bar = Progress(TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[pace]}"))
         self._task = self._bar.add_task(description, total=total, completed=done, pace="starting")
         self._live: Live | None = None
 

@@ -46,9 +46,7 @@ def p_controller() -> Policy:
 
     def act(params, carry, rover, observation, is_first, key):
         bearing = jax.vmap(goal_bearing_rad)(rover)
-        return carry, jnp.clip(
-            jnp.stack([P_CRUISE - bearing, P_CRUISE + bearing], axis=-1), 0.0, 1.0
-        )
+        return carry, jnp.clip(jnp.stack([P_CRUISE - bearing, P_CRUISE + bearing], axis=-1), 0.0, 1.0)
 
     return Policy("p", observes=False, initial_carry=lambda num_envs: (), act=act)
 

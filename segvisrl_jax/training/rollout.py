@@ -52,9 +52,7 @@ def unroll(
         the episodes' log (T, B).
     """
     decide = functools.partial(_decide, env=env, network=network, config=config)
-    after, (steps, log) = jax.lax.scan(
-        lambda state, _: decide(params, state), actor, None, length=config.unroll_length
-    )
+    after, (steps, log) = jax.lax.scan(lambda state, _: decide(params, state), actor, None, length=config.unroll_length)
     trajectory = Trajectory(carry=actor.carry, **steps)
     observation = env.observe(after.env)
     _, last = network.step(params, after.carry, observation, after.env.is_first)
@@ -81,9 +79,7 @@ def _decide(
         "truncation_value": _truncation_value(params, carry, step, env, network, config),
         "reset": actor.env.is_first,
     }
-    log = EpisodeLog(
-        step.outcome, step.episode_return, step.num_decisions, step.rover.path_length_m, step.terms
-    )
+    log = EpisodeLog(step.outcome, step.episode_return, step.num_decisions, step.rover.path_length_m, step.terms)
     return ActorState(after, carry, next_key), (kept, log)
 
 
@@ -97,7 +93,6 @@ def _truncation_value(
 
     def look(_: None) -> Float32[Array, "B"]:
         observation = jax.vmap(env.env.observe)(step.rover)
-        _, output = network.step(params, carry, observation, nothing)
-        return output.value
+        return network.step(params, carry, observation, nothing)[1].value
 
     return jax.lax.cond(jnp.any(step.truncated > 0), look, lambda _: nothing, None)

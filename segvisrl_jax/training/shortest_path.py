@@ -27,18 +27,14 @@ from segvisrl_jax.training.tangent_graph import (
     tangent_graph,
 )
 
-ARC_STEP_RAD = np.radians(
-    5.0
-)  # spacing of an arc's points: at 0.5 m they cut 0.5 mm off the circle
+ARC_STEP_RAD = np.radians(5.0)  # spacing of an arc's points: at 0.5 m they cut 0.5 mm off the circle
 
 
 class ShortestPath(NamedTuple):
     """A path: its exact length, and points along it (arcs are sampled: a hair shorter)."""
 
     length_m: float  # infinite where there is no path
-    points_m: Float[
-        np.ndarray, "K 2"
-    ]  # from the start to the goal's boundary; none where there is no path
+    points_m: Float[np.ndarray, "K 2"]  # from the start to the goal's boundary; none where there is no path
 
 
 def shortest_path_m(
@@ -50,9 +46,7 @@ def shortest_path_m(
     map_half_size_m: float,
 ) -> float:
     """Length of the path that ``shortest_path`` finds; the arguments are the same."""
-    return shortest_path(
-        start_xy, goal_xy, goal_radius_m, rock_xy, rock_radius_m, map_half_size_m
-    ).length_m
+    return shortest_path(start_xy, goal_xy, goal_radius_m, rock_xy, rock_radius_m, map_half_size_m).length_m
 
 
 def shortest_path(
@@ -137,9 +131,7 @@ def _route_points(
     return points[np.append(True, moves)]
 
 
-def _arc_points(
-    graph: TangentGraph, here: int, there: int, length: float, radius: float
-) -> Float[np.ndarray, "P 2"]:
+def _arc_points(graph: TangentGraph, here: int, there: int, length: float, radius: float) -> Float[np.ndarray, "P 2"]:
     """Points of the arc of this length from one node to another, without the first."""
     swept_rad = length / radius
     forward = np.mod(graph.angle[there] - graph.angle[here], 2 * np.pi)

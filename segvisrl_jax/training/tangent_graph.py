@@ -90,9 +90,7 @@ def _goal_corners(world: World) -> Float[np.ndarray, "K 2"]:
     crosses = distance <= world.goal_radius + world.radius
     crosses &= distance >= max(abs(world.goal_radius - world.radius), TOLERANCE_M)
     offset, distance = offset[crosses], distance[crosses]
-    cosine = (distance**2 + world.goal_radius**2 - world.radius**2) / (
-        2 * distance * world.goal_radius
-    )
+    cosine = (distance**2 + world.goal_radius**2 - world.radius**2) / (2 * distance * world.goal_radius)
     half_angle = np.arccos(np.clip(cosine, -1.0, 1.0))
     angle = np.arctan2(offset[:, 1], offset[:, 0])[:, None] + SIDES * half_angle[:, None]
     points = world.goal + world.goal_radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -228,8 +226,6 @@ def _clearance_m(
     return np.sqrt(squared.min(axis=1, initial=np.inf))
 
 
-def _on_circle(
-    world: World, disc: Int[np.ndarray, "*S"], angle: Float[np.ndarray, "*S"]
-) -> Float[np.ndarray, "*S 2"]:
+def _on_circle(world: World, disc: Int[np.ndarray, "*S"], angle: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S 2"]:
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return world.discs[disc] + world.radius * unit

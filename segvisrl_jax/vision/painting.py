@@ -13,12 +13,13 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32, UInt8, UInt16
 
+from segvisrl_jax.vision.classes import SegmentationClass
 from segvisrl_jax.vision.shading import Faces, Surfaces, face_light
 
-WINDOW = (
-    32,
-    64,
-)  # rows and columns shaded at a time on a CPU: 8 KiB of float32, a part of its first cache
+SOLID_WINDOW = (32, 64)
+"""Rows and columns shaded at a time on a CPU: 8 KiB of float32, a part of its first cache."""
+GROUND_WINDOW = (16, 2048)
+"""The ground fills its rows: whole rows, or nearly."""
 
 
 @struct.dataclass
@@ -48,14 +49,14 @@ class Lines:
         u_px, v_px = (np.asarray(lines, np.float32) + half for lines in (columns, rows))
         return cls(jnp.asarray(columns, jnp.uint16), jnp.asarray(u_px), jnp.asarray(v_px))
 
-
-@struct.dataclass
-class Solids:
-    """Solids as they are painted, from far to near."""
-
-    span: Columns
-    faces: Faces
-    kind: UInt8[Array, "N"]  # class
+    def cut(self, corner: tuple[Array, Array], size: tuple[int, int]) -> "Lines":
+        """The lines of one window."""
+        (row, column), (height, width) = corner, size
+        return Lines(
+            columns=jax.lax.dynamic_slice_in_dim(self.columns, column, width),
+            u_px=jax.lax.dynamic_slice_in_dim(self.u_px, column, width),
+            v_px=jax.lax.dynamic_slice_in_dim(self.v_px, row, height),
+        )
 
 
 @struct.dataclass
@@ -65,62 +66,116 @@ class Picture:
     light: Float32[Array, "rows columns"]
     kind: UInt8[Array, "rows columns"]
 
-    def add(self, solid: Solids, lines: Lines, surfaces: Surfaces) -> "Picture":
+    def cover(
+        self, where: Bool[Array, "rows columns"], light: Float32[Array, "rows columns"], kind: Array
+    ) -> "Picture":
+        """The picture with something in front of it."""
+        return Picture(jnp.where(where, light, self.light), jnp.where(where, kind, self.kind))
+
+
+@struct.dataclass
+class Ground:
+    """The ground as it is painted. ``sun_and_surface`` answers for any lines (``shading.ground_light``)."""
+
+    span: Columns
+    shadows: Columns  # (N, rows)
+    sun_and_surface: Callable[[Array, Array], tuple[Array, Array]] = struct.field(pytree_node=False)
+
+    def add_to(self, picture: Picture, lines: Lines, surfaces: Surfaces) -> Picture:
+        """The picture with the ground in front of it."""
+        sun, surface = self.sun_and_surface(lines.u_px, lines.v_px)
+        for number in range(self.shadows.first.shape[0]):
+            one = jax.tree.map(lambda array, number=number: array[number], self.shadows)
+            sun = jnp.where(one.cover(lines.columns), 0.0, sun)
+        light = surfaces.light_on(sun) * surface
+        kind = np.uint8(SegmentationClass.GROUND)
+        return picture.cover(self.span.cover(lines.columns), light, kind)
+
+    def cut_rows(self, row: Array, height: int) -> "Ground":
+        """The same in fewer rows."""
+        span, shadows = _cut_rows((self.span, self.shadows), row, height)
+        return self.replace(span=span, shadows=shadows)
+
+
+@struct.dataclass
+class Solids:
+    """Solids as they are painted, from far to near; or one of them, without the leading axis."""
+
+    span: Columns
+    faces: Faces
+    kind: UInt8[Array, "*N"]  # class
+
+    def add_to(self, picture: Picture, lines: Lines, surfaces: Surfaces) -> Picture:
         """The picture with one solid in front of it."""
-        covers = solid.span.cover(lines.columns)
-        light = surfaces.light_on(face_light(solid.faces, lines.u_px, lines.v_px))
-        return Picture(
-            light=jnp.where(covers, light, self.light),
-            kind=jnp.where(covers, solid.kind, self.kind),
-        )
+        light = surfaces.light_on(face_light(self.faces, lines.u_px, lines.v_px))
+        return picture.cover(self.span.cover(lines.columns), light, self.kind)
+
+    def cut_rows(self, row: Array, height: int) -> "Solids":
+        """The same in fewer rows."""
+        return self.replace(span=_cut_rows(self.span, row, height))
+
+
+def paint_ground(ground: Ground, lines: Lines, surfaces: Surfaces) -> Picture:
+    """The ground, with shadows on it, in front of space."""
+    shape = (len(lines.v_px), len(lines.columns))
+    space = Picture(jnp.zeros(shape, jnp.float32), jnp.zeros(shape, jnp.uint8))
+    return jax.lax.platform_dependent(
+        space,
+        ground,
+        cpu=lambda picture, layer: _add_in_windows(picture, layer, lines, surfaces, GROUND_WINDOW),
+        default=lambda picture, layer: layer.add_to(picture, lines, surfaces),
+    )
 
 
 def paint_solids(picture: Picture, solids: Solids, lines: Lines, surfaces: Surfaces) -> Picture:
     """The picture with all solids in it."""
 
-    def paint(add: Callable, picture: Picture, solids: Solids) -> Picture:
-        def add_next(number: Array, picture: Picture) -> Picture:
-            return add(picture, jax.tree.map(lambda array: array[number], solids))
+    def in_windows(number: Array, picture: Picture) -> Picture:
+        return _add_in_windows(picture, take(number), lines, surfaces, SOLID_WINDOW)
 
-        return jax.lax.fori_loop(0, len(solids.kind), add_next, picture)
+    def everywhere(number: Array, picture: Picture) -> Picture:
+        return take(number).add_to(picture, lines, surfaces)
 
+    def take(number: Array) -> Solids:
+        return jax.tree.map(lambda array: array[number], solids)
+
+    loop = functools.partial(jax.lax.fori_loop, 0, len(solids.kind))
     return jax.lax.platform_dependent(
-        picture,
-        solids,
-        cpu=functools.partial(paint, lambda p, solid: _add_in_windows(p, solid, lines, surfaces)),
-        default=functools.partial(paint, lambda p, solid: p.add(solid, lines, surfaces)),
+        picture, cpu=lambda p: loop(in_windows, p), default=lambda p: loop(everywhere, p)
     )
 
 
-def _add_in_windows(picture: Picture, solid: Solids, lines: Lines, surfaces: Surfaces) -> Picture:
-    """Adds one solid, window by window. Windows at the border overlap others: painting twice is harmless."""
-    size = tuple(
-        min(window, whole) for window, whole in zip(WINDOW, picture.kind.shape, strict=True)
-    )
-    corner, count = _touched_windows(solid.span, lines, size)
+def _add_in_windows(
+    picture: Picture,
+    layer: Ground | Solids,
+    lines: Lines,
+    surfaces: Surfaces,
+    window: tuple[int, int],
+) -> Picture:
+    """Adds a layer in the windows that it touches. At the border they overlap: painting twice is harmless."""
+    height, width = (min(pair) for pair in zip(window, picture.kind.shape, strict=True))
+    start, count = _touched_windows(layer.span, lines, (height, width))
+    last = jnp.array(picture.kind.shape) - jnp.array([height, width])
 
     def add_window(number: Array, picture: Picture) -> Picture:
-        row = corner[0] + number // count[1] * size[0]
-        column = corner[1] + number % count[1] * size[1]
-        part = jax.tree.map(lambda image: _cut(image, (row, column), size), picture)
-        seen = Lines(
-            columns=_cut(lines.columns, (column,), size[1:]),
-            u_px=_cut(lines.u_px, (column,), size[1:]),
-            v_px=_cut(lines.v_px, (row,), size[:1]),
+        step = jnp.stack([number // count[1], number % count[1]])
+        row, column = corner = tuple(jnp.minimum(start + step * jnp.array([height, width]), last))
+        part = jax.tree.map(
+            lambda image: jax.lax.dynamic_slice(image, corner, (height, width)), picture
         )
-        span = jax.tree.map(lambda array: _cut(array, (row,), size[:1]), solid.span)
-        part = part.add(solid.replace(span=span), seen, surfaces)
+        seen = lines.cut((row, column), (height, width))
+        part = layer.cut_rows(row, height).add_to(part, seen, surfaces)
         return jax.tree.map(
-            lambda image, new: jax.lax.dynamic_update_slice(image, new, (row, column)),
-            picture,
-            part,
+            lambda image, new: jax.lax.dynamic_update_slice(image, new, corner), picture, part
         )
 
     return jax.lax.fori_loop(0, count[0] * count[1], add_window, picture)
 
 
-def _cut(array: Array, corner: tuple[Array, ...], size: tuple[int, ...]) -> Array:
-    return jax.lax.dynamic_slice(array, corner, size)
+def _cut_rows(spans, row: Array, height: int):
+    return jax.tree.map(
+        lambda array: jax.lax.dynamic_slice_in_dim(array, row, height, axis=-1), spans
+    )
 
 
 def _touched_windows(

@@ -22,10 +22,11 @@ from segvisrl_jax.types import CameraPose, Scene
 from segvisrl_jax.vision.classes import SegmentationClass
 from segvisrl_jax.vision.painting import (
     Columns,
+    Ground,
     Lines,
-    Picture,
     Solids,
     one_by_one_on_cpu,
+    paint_ground,
     paint_solids,
 )
 from segvisrl_jax.vision.polyhedra import Polyhedra
@@ -109,17 +110,13 @@ class ScanlineRenderer:
 
     def _draw_rgb(self, scene: Scene, camera: CameraPose) -> UInt8[Array, "rows columns 3"]:
         layers = (self._ground(camera), *self._shaded_layers(scene, camera))
-        ground_span, shadow_spans, solids = jax.lax.optimization_barrier(layers)
+        span, shadows, solids = jax.lax.optimization_barrier(layers)
+
+        def sun_and_surface(u_px: Array, v_px: Array) -> tuple[Array, Array]:
+            return ground_light(u_px, v_px, camera, scene.sun_direction, self._projection)
+
         lines = self._lines()
-        sun, surface = ground_light(
-            lines.u_px, lines.v_px, camera, scene.sun_direction, self._projection
-        )
-        for span in _each(shadow_spans):
-            sun = jnp.where(span.cover(lines.columns), 0.0, sun)
-        picture = Picture(
-            light=self._surfaces.light_on(sun) * surface,
-            kind=jnp.where(ground_span.cover(lines.columns), GROUND, SPACE),
-        )
+        picture = paint_ground(Ground(span, shadows, sun_and_surface), lines, self._surfaces)
         picture = paint_solids(picture, solids, lines, self._surfaces)
         return self._surfaces.paint(picture.light, picture.kind)
 

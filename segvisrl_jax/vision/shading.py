@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float32, Int32, UInt8
+from jaxtyping import Array, Float32, UInt8, UInt32
 
 from segvisrl_jax.assets import asset_dir
 from segvisrl_jax.types import CameraPose
@@ -20,9 +20,10 @@ from segvisrl_jax.vision.classes import SegmentationClass
 from segvisrl_jax.vision.polyhedra import Polyhedra
 from segvisrl_jax.vision.projection import Projection, Stand, camera_axes, rotate
 
-RELIEF = ((1.6, 0.05), (0.4, 0.015), (0.1, 0.004))
-"""The ground's unevenness, coarse to fine: (wavelength, height) in metres. Slopes of about one in ten: gently
-rolling regolith. It is light and shade only; the ground's shape is flat."""
+STEP_X, STEP_Y, SEED_STEP, MIXER = 0x9E3779B1, 0x85EBCA77, 0x27D4EB2F, 0xC2B2AE3D
+"""Large odd numbers (the primes of the xxHash function): they scatter neighbours over all 32 bits."""
+PART_BITS = 10  # three random numbers from one word
+MAX_CRATER_RADIUS = 0.4  # of its cell's side: craters of one size do not meet
 STAIN = 0.06  # how much lighter and darker the ground is where it is high and low, as a share
 FADE_PX = (
     4.0  # a wave shorter than this many source pixels has faded out: downsampling would alias it
@@ -90,23 +91,23 @@ def ground_light(
     # One pixel's footprint along the line of sight, which is its longer side.
     footprint = depth**2 / (projection.focal_px * jnp.maximum(camera.position_m[2], LOWEST_SLOPE))
     height, slope_x, slope_y = jnp.zeros_like(x), jnp.zeros_like(x), jnp.zeros_like(x)
-    for number, (wavelength, amplitude) in enumerate(RELIEF):
-        waves = _waves(x / wavelength, y / wavelength, number)
-        strength = jnp.clip(2.0 - 2.0 * FADE_PX * footprint / wavelength, 0.0, 1.0)
-        height += strength * waves[0] / len(RELIEF)
-        slope_x += strength * waves[1] * (amplitude / wavelength)
-        slope_y += strength * waves[2] * (amplitude / wavelength)
+    for seed, (make, size, steepness) in enumerate(RELIEF):
+        form = make(x / size, y / size, seed)
+        strength = jnp.clip(2.0 - 2.0 * FADE_PX * footprint / size, 0.0, 1.0)
+        height += strength * form[0] / len(RELIEF)
+        slope_x += strength * steepness * form[1]
+        slope_y += strength * steepness * form[2]
     sun = sun_direction[2] - slope_x * sun_direction[0] - slope_y * sun_direction[1]
     return jnp.maximum(sun, 0.0) * (sun_direction[2] > 0.0), 1.0 + STAIN * height
 
 
 def _waves(x: Array, y: Array, seed: int) -> tuple[Array, Array, Array]:
-    """Smooth noise in [-1, 1] with a random value at every whole (x, y), and its two derivatives."""
-    cell_x, cell_y = jnp.floor(x), jnp.floor(y)
-    in_x, in_y = x - cell_x, y - cell_y
-    i, j = cell_x.astype(jnp.int32), cell_y.astype(jnp.int32)
-    a, b = _scatter(i, j, seed), _scatter(i + 1, j, seed)
-    c, d = _scatter(i, j + 1, seed), _scatter(i + 1, j + 1, seed)
+    """Smooth noise in [-1, 1], a random value at every whole (x, y); and its two derivatives."""
+    in_x, in_y, key = _cell(x, y, seed)
+    a, b, c, d = (
+        _random(key + np.uint32(corner))
+        for corner in (0, STEP_X, STEP_Y, (STEP_X + STEP_Y) % 2**32)
+    )
     ease_x, ease_y = in_x * in_x * (3.0 - 2.0 * in_x), in_y * in_y * (3.0 - 2.0 * in_y)
     rate_x, rate_y = 6.0 * in_x * (1.0 - in_x), 6.0 * in_y * (1.0 - in_y)
     twist = a - b - c + d
@@ -114,14 +115,51 @@ def _waves(x: Array, y: Array, seed: int) -> tuple[Array, Array, Array]:
     return value, rate_x * (b - a + twist * ease_y), rate_y * (c - a + twist * ease_x)
 
 
-def _scatter(i: Int32[Array, "*P"], j: Int32[Array, "*P"], seed: int) -> Float32[Array, "*P"]:
-    """A number in [-1, 1) for every lattice point: multiply by large odd numbers, fold high bits down."""
-    bits = i.astype(jnp.uint32) * np.uint32(0x9E3779B1) + j.astype(jnp.uint32) * np.uint32(
-        0x85EBCA77
-    )
-    bits = (bits + np.uint32(seed * 0x27D4EB2F % 2**32)) * np.uint32(0xC2B2AE3D)
-    bits = (bits ^ (bits >> 15)) * np.uint32(0x85EBCA6B)
-    return (bits >> 8).astype(jnp.float32) * np.float32(2**-23) - 1.0
+def _craters(x: Array, y: Array, seed: int) -> tuple[Array, Array, Array]:
+    """One round bowl in every unit cell: (0, its slope in x, in y), at most 1, level at rim and middle."""
+    in_x, in_y, key = _cell(x, y, seed)
+    bits = _mix(key)
+    away_x = in_x - 0.5 - (0.5 - MAX_CRATER_RADIUS) * _part(bits, 0)
+    away_y = in_y - 0.5 - (0.5 - MAX_CRATER_RADIUS) * _part(bits, PART_BITS)
+    per_radius = (2.5 + 1.5 * _part(bits, 2 * PART_BITS)) / MAX_CRATER_RADIUS
+    distance = jnp.sqrt(away_x**2 + away_y**2) * per_radius
+    slope = 4.0 * per_radius * jnp.maximum(1.0 - distance, 0.0)
+    return jnp.zeros_like(x), slope * away_x, slope * away_y
+
+
+def _cell(x: Array, y: Array, seed: int) -> tuple[Array, Array, UInt32[Array, "*P"]]:
+    """Where in its unit cell a point is, and the cell's number."""
+    cell_x, cell_y = jnp.floor(x), jnp.floor(y)
+    number = cell_x.astype(jnp.int32).astype(jnp.uint32) * np.uint32(STEP_X)
+    number += cell_y.astype(jnp.int32).astype(jnp.uint32) * np.uint32(STEP_Y)
+    return x - cell_x, y - cell_y, number + np.uint32(seed * SEED_STEP % 2**32)
+
+
+def _random(number: UInt32[Array, "*P"]) -> Float32[Array, "*P"]:
+    """A number in [-1, 1) for every number."""
+    return _part(_mix(number), 0)
+
+
+def _mix(number: UInt32[Array, "*P"]) -> UInt32[Array, "*P"]:
+    """Scatters a number over all bits: fold the high bits down, multiply, fold again."""
+    bits = (number ^ (number >> 15)) * np.uint32(MIXER)
+    return bits ^ (bits >> 14)
+
+
+def _part(bits: UInt32[Array, "*P"], lowest: int) -> Float32[Array, "*P"]:
+    """Some of the bits as a number in [-1, 1)."""
+    part = (bits >> lowest) & np.uint32(2**PART_BITS - 1)
+    return part.astype(jnp.int32).astype(jnp.float32) * np.float32(2.0 ** (1 - PART_BITS)) - 1.0
+
+
+RELIEF = (
+    (_craters, 3.1, 0.20),
+    (_craters, 0.9, 0.25),
+    (_waves, 0.35, 0.06),
+    (_waves, 0.09, 0.08),
+)
+"""The ground's unevenness: (form, size of its cells in metres, steepness). Gently rolling regolith
+with shallow craters. It is light and shade only; the ground's shape is flat."""
 
 
 @struct.dataclass

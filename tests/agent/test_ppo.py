@@ -58,6 +58,8 @@ def act(network: Network, params, carry, observation, reset, key):
 def rollout(arch: str) -> tuple[LearnerState, Trajectory]:
     """A fresh learner, and a trajectory that it drove step by step through random observations."""
     network, state = built(arch), learner_of(arch).init(jax.random.key(0))
+    head = state.params["params"]["policy_head"]
+    head["kernel"] = head["kernel"] * 100  # so that the action depends on what is seen and recalled
     rng = np.random.default_rng(0)
     if network.has_convolutions:
         observation = jnp.asarray(rng.integers(0, 256, (T, B, *IMAGE), dtype=np.uint8))

@@ -82,7 +82,7 @@ def test_train_eval_demo_as_a_user_does(arch, tmp_path):
     judged = segvisrl("eval", "--run", run, "--episodes", "6", "--num-rocks", "2", "--json", "out.json", cwd=tmp_path)
     assert judged.returncode == 0, judged.stderr
     result = json.loads((tmp_path / "out.json").read_text())
-    assert SUMMARY_KEYS <= set(result)
+    assert set(result) >= SUMMARY_KEYS
     assert result["success"] + result["collision"] + result["fall"] + result["timeout"] == pytest.approx(1)
     assert result["config"]["scene"]["num_rocks"] == 2
 
@@ -91,7 +91,7 @@ def test_controllers_need_no_images(tmp_path):
     done = segvisrl("eval", "--controller", "p", "--episodes", "40", "--seed", "3", "--json", "p.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "p.json").read_text())
-    assert SUMMARY_KEYS <= set(result)
+    assert set(result) >= SUMMARY_KEYS
     assert result["episodes"] == 40
     assert result["seed"] == 3
     assert result["success"] > 0.75

@@ -69,9 +69,7 @@ def test_lean_model_moves_as_the_full_one(full: mujoco.MjModel, lean: mujoco.MjM
     assert lean.ngeom == 5
     for name in ("rover", *rover_model.WHEEL_NAMES):
         for field in ("mass", "inertia", "ipos", "iquat", "pos", "quat"):
-            np.testing.assert_array_equal(
-                getattr(full.body(name), field), getattr(lean.body(name), field)
-            )
+            np.testing.assert_array_equal(getattr(full.body(name), field), getattr(lean.body(name), field))
     finals = []
     for model in (full, lean):
         data = mujoco.MjData(model)
@@ -91,9 +89,7 @@ def test_only_wheels_touch_only_the_ground(full: mujoco.MjModel) -> None:
 def test_settings_reach_the_model() -> None:
     config = EnvConfig(
         scene=SceneConfig(map_size_m=40.0, num_rocks=1, num_rock_shapes=2, sun_azimuth_deg=0.0),
-        physics=PhysicsConfig(
-            timestep_s=0.01, gravity_m_s2=3.24, wheel_friction=0.5, top_speed_m_s=0.35
-        ),
+        physics=PhysicsConfig(timestep_s=0.01, gravity_m_s2=3.24, wheel_friction=0.5, top_speed_m_s=0.35),
         camera=CameraConfig(width_px=640, height_px=480, near_m=0.02, far_m=30.0),
     )
     model = rover_model.build_model(config)
@@ -221,9 +217,7 @@ def test_camera_sees_nothing_of_the_rover(full: mujoco.MjModel, scene: Scene) ->
     with mujoco.Renderer(full, 540, 960) as renderer:
         renderer.enable_segmentation_rendering()
         for wheel_angle, (roll, pitch) in enumerate(tilts):
-            qpos = np.r_[
-                CONFIG.scene.start_xy_m, 0.07, 1, roll / 2, pitch / 2, 0, [wheel_angle] * 4
-            ]
+            qpos = np.r_[CONFIG.scene.start_xy_m, 0.07, 1, roll / 2, pitch / 2, 0, [wheel_angle] * 4]
             state = PhysicsState(qpos=qpos, qvel=np.zeros(10))
             rover_model.set_mujoco_state(full, data, state, scene)
             renderer.update_scene(data, "d435")

@@ -179,9 +179,7 @@ def test_shapes_and_types(name: str) -> None:
     assert not any(leaf.weak_type for leaf in jax.tree.leaves((out, state)))
 
 
-def test_native_diverges_where_mujoco_warns(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_native_diverges_where_mujoco_warns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """MuJoCo stops and repeats a state it warns of, finite though it is: that is no standing still.
 
     A short time step keeps the state finite while the acceleration is beyond MuJoCo's bound.
@@ -279,9 +277,7 @@ def test_random_driving_is_calm(num_envs: int) -> None:
         (0.04, 1.62, 0.3),
     ],
 )
-def test_other_settings_drive_too(
-    timestep_s: float, gravity_m_s2: float, wheel_friction: float
-) -> None:
+def test_other_settings_drive_too(timestep_s: float, gravity_m_s2: float, wheel_friction: float) -> None:
     physics = PhysicsConfig(
         engine="native",
         timestep_s=timestep_s,

@@ -27,9 +27,7 @@ def test_mp4_decodes_to_the_same_frames(tmp_path):
     assert decoded.shape == frames.shape
     difference = np.abs(decoded.astype(int) - frames)
     assert difference.mean() < 4
-    middle = difference[
-        :, 30:42
-    ]  # inside the square, away from edges, which lose half their colour
+    middle = difference[:, 30:42]  # inside the square, away from edges, which lose half their colour
     for index, row in enumerate(middle):
         assert row[:, 8 * index + 8 : 8 * index + 24].max() < 16
 
@@ -43,9 +41,7 @@ def test_mp4_opens_in_a_browser(tmp_path):
         assert stream.average_rate == 5
         assert stream.frames == 12
     data = path.read_bytes()
-    assert (
-        0 < data.find(b"moov") < data.find(b"mdat")
-    )  # the index is in front: starts while it loads
+    assert 0 < data.find(b"moov") < data.find(b"mdat")  # the index is in front: starts while it loads
 
 
 def test_odd_sizes_are_padded_and_frames_may_come_one_by_one(tmp_path):
@@ -129,9 +125,7 @@ def test_compose_refuses_what_does_not_fit():
         compose_frame([[Pane(plain(10, 10, 0))]] * 20, width_px=100)
 
 
-SCENE = SceneMap(
-    np.array([-12.0, 0.0]), np.array([3.0, 4.0]), np.array([[5.0, -6.0]]), np.array([0.3])
-)
+SCENE = SceneMap(np.array([-12.0, 0.0]), np.array([3.0, 4.0]), np.array([[5.0, -6.0]]), np.array([0.3]))
 SIZE_PX, HALF_M = 524, 13.1  # 20 pixels a metre, with the margin around the map
 
 

@@ -7,13 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from segvisrl_jax.config import ConfigError, from_dict, preset_config, to_dict
-from segvisrl_jax.config import TrainConfig
+from segvisrl_jax.config import ConfigError, TrainConfig, from_dict, preset_config, to_dict
 from segvisrl_jax.training.checkpoint import Checkpoints, load_policy, save_policy
 
 
 def state():
-    return {"params": {"w": jnp.arange(6.0).reshape(2, 3) / 3}, "key": jax.random.split(jax.random.key(3), 2), "n": jnp.int32(7)}
+    return {
+        "params": {"w": jnp.arange(6.0).reshape(2, 3) / 3},
+        "key": jax.random.split(jax.random.key(3), 2),
+        "n": jnp.int32(7),
+    }
 
 
 def test_checkpoints_come_back_bit_by_bit(tmp_path):
@@ -40,7 +43,12 @@ def test_a_checkpoint_of_another_shape_is_refused(tmp_path):
 
 def test_policies_come_back_bit_by_bit(tmp_path):
     config = preset_config("cnn_lstm", "cpu")
-    params = {"params": {"body": {"kernel": np.random.default_rng(0).normal(size=(3, 3)).astype(np.float32)}, "log_std": np.zeros(2, np.float32)}}
+    params = {
+        "params": {
+            "body": {"kernel": np.random.default_rng(0).normal(size=(3, 3)).astype(np.float32)},
+            "log_std": np.zeros(2, np.float32),
+        }
+    }
     save_policy(tmp_path / "policy", config, params, {"success": 0.5})
     stored, found, scores = load_policy(tmp_path / "policy")
     assert stored == config
@@ -64,7 +72,7 @@ def test_a_damaged_policy_is_named(name, damage, tmp_path):
 
 
 def test_an_unknown_policy_is_answered_with_those_there_are():
-    with pytest.raises(ConfigError, match="should be a folder with policy.json"):
+    with pytest.raises(ConfigError, match=r"should be a folder with policy\.json"):
         load_policy("no_such_policy")
 
 

@@ -33,7 +33,10 @@ def final_state(config):
 
 
 def as_arrays(tree):
-    return [np.asarray(jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key) else x) for x in jax.tree.leaves(tree)]
+    return [
+        np.asarray(jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
+        for x in jax.tree.leaves(tree)
+    ]
 
 
 @pytest.mark.parametrize("arch", ["cnn_lstm", "mlp"])
@@ -97,7 +100,7 @@ def test_an_existing_run_is_not_overwritten(tmp_path):
     config = tiny("mlp", tmp_path, updates=1, run="run")
     loop.train(config, **QUIET)
     before = (tmp_path / "run" / "metrics.jsonl").read_bytes()
-    with pytest.raises(ConfigError, match="exists already.*--resume"):
+    with pytest.raises(ConfigError, match=r"exists already.*--resume"):
         loop.train(config, **QUIET)
     assert (tmp_path / "run" / "metrics.jsonl").read_bytes() == before
 

@@ -12,16 +12,12 @@ from segvisrl_jax.training.shortest_path import shortest_path, shortest_path_m
 
 ROCK, GOAL, HALF = 0.5, 1.0, 12.5
 HUGE = 1e6
-SIDES_OF_POLYGON = (
-    64  # a polygon around a circle is longer than the circle by tan(pi/64) / (pi/64): 0.08 %
-)
+SIDES_OF_POLYGON = 64  # a polygon around a circle is longer than the circle by tan(pi/64) / (pi/64): 0.08 %
 
 
 def path_to(goal, rocks, start=(-5.0, 0.0), half=HALF, goal_radius=GOAL):
     rocks = np.array(rocks, float).reshape(-1, 2)
-    return shortest_path(
-        np.array(start, float), np.array(goal, float), goal_radius, rocks, ROCK, half
-    )
+    return shortest_path(np.array(start, float), np.array(goal, float), goal_radius, rocks, ROCK, half)
 
 
 def polyline_m(path):
@@ -187,11 +183,7 @@ def random_scene(seed, num_rocks, spread):
 def dense_upper_bound_m(start, goal, rocks, half):
     """Dijkstra over the corners of polygons around the circles, all pairs that see each other."""
     angle = 2 * np.pi * np.arange(SIDES_OF_POLYGON) / SIDES_OF_POLYGON
-    ring = (
-        np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        * ROCK
-        / math.cos(math.pi / SIDES_OF_POLYGON)
-    )
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * ROCK / math.cos(math.pi / SIDES_OF_POLYGON)
     points = np.concatenate([[start, goal], (rocks[:, None] + ring).reshape(-1, 2)])
     distance = np.linalg.norm(points[:, None] - rocks, axis=-1)
     free = (distance >= ROCK - 1e-9).all(axis=1) & (np.abs(points) <= half).all(axis=1)

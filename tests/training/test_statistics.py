@@ -80,9 +80,7 @@ def test_mcnemar_refuses_negative_counts():
 def test_spl_and_path_ratio_by_hand():
     success = np.array([True, True, False, True])
     shortest = np.array([10.0, 8.0, 5.0, 4.0])
-    driven = np.array(
-        [20.0, 8.0, 5.0, 3.9]
-    )  # the last: judged at instants, a hair below the shortest
+    driven = np.array([20.0, 8.0, 5.0, 3.9])  # the last: judged at instants, a hair below the shortest
     assert spl(success, shortest, driven) == pytest.approx((0.5 + 1 + 0 + 1) / 4)
     assert path_ratio(success, shortest, driven) == pytest.approx((2 + 1 + 0.975) / 3)
 

@@ -71,9 +71,7 @@ def wheel_command(action: Float[Array, "2"], max_wheel_speed_rad_s: float) -> Fl
     return share[side] * max_wheel_speed_rad_s
 
 
-def keep_diverged(
-    start: PhysicsState, action: Float[Array, "2"], states: PhysicsState
-) -> PhysicsState:
+def keep_diverged(start: PhysicsState, action: Float[Array, "2"], states: PhysicsState) -> PhysicsState:
     """Makes every state NaN from the first diverged one on; start and action count as the first.
 
     Args:

@@ -10,9 +10,7 @@ from segvisrl_jax.env.model import build_physics_model
 from segvisrl_jax.env.physics import engine
 from segvisrl_jax.types import Action, PhysicsState
 
-_Carry = tuple[
-    Array, Array, Array
-]  # qpos, qvel, and the solver's warm start, which lives for one decision
+_Carry = tuple[Array, Array, Array]  # qpos, qvel, and the solver's warm start, which lives for one decision
 
 
 class MjxEngine:

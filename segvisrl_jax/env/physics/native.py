@@ -101,9 +101,7 @@ class NativeEngine:
         full = np.concatenate([np.zeros((len(start), 1)), start], axis=1)
         num_steps = self._stride * self._num_judgements
         with self._lock:
-            states, _ = self._pool.rollout(
-                self._model, self._data, full, control.astype(np.float64), nstep=num_steps
-            )
+            states, _ = self._pool.rollout(self._model, self._data, full, control.astype(np.float64), nstep=num_steps)
         judged = states[:, self._stride - 1 :: self._stride]
         steps_done = np.rint(judged[..., 0] / self._model.opt.timestep)
         steps_due = self._stride * np.arange(1, self._num_judgements + 1)

@@ -1,0 +1,36 @@
+"""Every setting of the project, one frozen dataclass per part, checked when it is built.
+
+Units are in the names. A wrong value raises ``ConfigError`` with one line: the field, the value, what would be right.
+Nothing here depends on JAX or MuJoCo.
+"""
+
+from segvisrl_jax.config.checks import ConfigError, require
+from segvisrl_jax.config.environment import CameraConfig, EnvConfig, PhysicsConfig, SceneConfig, TaskConfig
+from segvisrl_jax.config.learning import EvaluationConfig, NetworkConfig, PPOConfig, TrainConfig
+from segvisrl_jax.config.names import ARCH_OBSERVATION, Arch, EngineName, ObservationKind, PresetName, RendererName
+from segvisrl_jax.config.presets import preset_config
+from segvisrl_jax.config.tree import from_dict, replace_fields, to_dict
+
+__all__ = [
+    "ARCH_OBSERVATION",
+    "Arch",
+    "CameraConfig",
+    "ConfigError",
+    "EngineName",
+    "EnvConfig",
+    "EvaluationConfig",
+    "NetworkConfig",
+    "ObservationKind",
+    "PPOConfig",
+    "PhysicsConfig",
+    "PresetName",
+    "RendererName",
+    "SceneConfig",
+    "TaskConfig",
+    "TrainConfig",
+    "from_dict",
+    "preset_config",
+    "replace_fields",
+    "require",
+    "to_dict",
+]

@@ -1,0 +1,173 @@
+"""Settings of a training run: network, PPO, evaluation, and all of it together."""
+
+from dataclasses import dataclass, field
+
+from segvisrl_jax.config.checks import require, require_choice, require_finite_numbers
+from segvisrl_jax.config.environment import EnvConfig
+from segvisrl_jax.config.names import ARCH_OBSERVATION, Arch, PresetName
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """The policy and value network (paper, section III-D)."""
+
+    channels: tuple[int, ...] = (16, 32, 32)
+    """Channels of the Impala CNN's stages (paper)."""
+    blocks_per_stage: int = 2
+    """Residual blocks in each stage (paper)."""
+    feature_size: int = 256
+    """Width of the dense layer behind the CNN."""
+    lstm_size: int = 256
+    """Width of the LSTM."""
+    mlp_sizes: tuple[int, ...] = (128, 128)
+    """Hidden layers of the mlp architecture."""
+    bounded_mean: bool = True
+    """The Gaussian's mean is squashed to the wheels' range [0, 1]; else it is free."""
+    initial_std: float = 0.25
+    """Standard deviation of the action at the start, as a share of the top speed."""
+
+    def __post_init__(self) -> None:
+        p = "network"
+        require_finite_numbers(self, p)
+        for name, sizes in (("channels", self.channels), ("mlp_sizes", self.mlp_sizes)):
+            good = isinstance(sizes, tuple) and len(sizes) > 0
+            good = good and all(type(size) is int and 1 <= size <= 4096 for size in sizes)
+            require(good, f"{p}.{name}", sizes, "one or more whole numbers in [1, 4096]")
+        require(0 <= self.blocks_per_stage <= 16, f"{p}.blocks_per_stage", self.blocks_per_stage, "in [0, 16]")
+        require(1 <= self.feature_size <= 8192, f"{p}.feature_size", self.feature_size, "in [1, 8192]")
+        require(1 <= self.lstm_size <= 8192, f"{p}.lstm_size", self.lstm_size, "in [1, 8192]")
+        require(0 < self.initial_std <= 10, f"{p}.initial_std", self.initial_std, "in (0, 10]")
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Proximal policy optimisation (paper, table I, gives steps, epochs, rates and weights)."""
+
+    num_envs: int = 32
+    """Environments that drive at once (paper: 1)."""
+    unroll_length: int = 64
+    """Decisions of each environment between two updates (paper: 64)."""
+    num_minibatches: int = 8
+    """Parts of a batch, cut by environment and never in time (paper: 1)."""
+    num_epochs: int = 4
+    """Passes over a batch (paper: 4)."""
+    learning_rate: float = 1e-3
+    """Adam's rate at the start (paper: 3e-4)."""
+    final_learning_rate_share: float = 0.05
+    """The rate falls linearly to this share of itself at the end (paper: 1, constant)."""
+    discount: float = 0.97
+    """Per decision (paper: 0.85)."""
+    gae_lambda: float = 0.95
+    """(paper: 0.95)."""
+    clip_epsilon: float = 0.2
+    """(paper: 0.2)."""
+    entropy_cost: float = 0.006
+    """(paper: 0.01)."""
+    value_cost: float = 0.5
+    """(paper: 0.5)."""
+    max_gradient_norm: float = 0.5
+    """(paper: 0.5)."""
+    reward_scale: float = 0.01
+    """Rewards are multiplied by this before learning (paper: 1)."""
+    normalize_advantage: bool = True
+    """Advantages of a batch are shifted and scaled to mean 0, deviation 1."""
+    kl_stop: float = 0.03
+    """A batch's epochs end early once the policy moved this far (approximate KL); 0 never stops."""
+    bootstrap_on_timeout: bool = False
+    """Whether the value of the last state stands in for what the time limit cut off; else it is an end like any other."""
+
+    @property
+    def decisions_per_update(self) -> int:
+        """Decisions in one batch."""
+        return self.num_envs * self.unroll_length
+
+    def __post_init__(self) -> None:
+        p = "ppo"
+        require_finite_numbers(self, p)
+        for name in ("num_envs", "unroll_length", "num_minibatches", "num_epochs"):
+            value = getattr(self, name)
+            require(1 <= value <= 10**6, f"{p}.{name}", value, "in [1, 1000000]")
+        divides = self.num_envs % self.num_minibatches == 0
+        should = f"a divisor of num_envs = {self.num_envs}, since minibatches are cut by environment"
+        require(divides, f"{p}.num_minibatches", self.num_minibatches, should)
+        require(0 < self.learning_rate <= 1, f"{p}.learning_rate", self.learning_rate, "in (0, 1]")
+        for name in ("final_learning_rate_share", "discount", "gae_lambda"):
+            value = getattr(self, name)
+            require(0 <= value <= 1, f"{p}.{name}", value, "in [0, 1]")
+        require(0 < self.clip_epsilon < 10, f"{p}.clip_epsilon", self.clip_epsilon, "in (0, 10)")
+        require(self.max_gradient_norm > 0, f"{p}.max_gradient_norm", self.max_gradient_norm, "positive")
+        require(self.reward_scale > 0, f"{p}.reward_scale", self.reward_scale, "positive")
+        for name in ("entropy_cost", "value_cost", "kl_stop"):
+            value = getattr(self, name)
+            require(value >= 0, f"{p}.{name}", value, "0 or more")
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """Held-out evaluation while training: on validation scenes, with deterministic actions."""
+
+    every_decisions: int = 40_960
+    """Training decisions between two evaluations (rounded up to whole updates)."""
+    episodes: int = 200
+    """Episodes of each."""
+    num_slots: int = 64
+    """Episodes that are driven at the same time; the scenes are the same for any number."""
+
+    def __post_init__(self) -> None:
+        p = "evaluation"
+        require_finite_numbers(self, p)
+        require(self.every_decisions >= 1, f"{p}.every_decisions", self.every_decisions, "1 or more")
+        require(1 <= self.episodes <= 10**7, f"{p}.episodes", self.episodes, "in [1, 10000000]")
+        require(1 <= self.num_slots <= 10**5, f"{p}.num_slots", self.num_slots, "in [1, 100000]")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One training run."""
+
+    arch: Arch = "cnn_lstm"
+    """cnn_lstm, cnn: segmented images, with and without memory; cnn_lstm_raw: colour images; mlp: the true state."""
+    preset: PresetName = "cpu"
+    """Where the defaults came from."""
+    seed: int = 0
+    steps: int = 327_680
+    """Training decisions in all (rounded up to whole updates)."""
+    run: str = ""
+    """Name of the run's folder; empty: made from arch, preset and seed."""
+    runs_dir: str = "runs"
+    """Where run folders go."""
+    resume: bool = False
+    """Go on from the run folder's last checkpoint."""
+    checkpoint_every_updates: int = 8
+    env: EnvConfig = field(default_factory=EnvConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+
+    @property
+    def run_name(self) -> str:
+        """The run folder's name."""
+        return self.run or f"{self.arch}-{self.preset}-seed{self.seed}"
+
+    @property
+    def num_updates(self) -> int:
+        """Updates that ``steps`` come to."""
+        return -(-self.steps // self.ppo.decisions_per_update)
+
+    def __post_init__(self) -> None:
+        require_choice(self.arch, Arch, "arch")
+        require_choice(self.preset, PresetName, "preset")
+        for name in ("seed", "steps", "checkpoint_every_updates"):
+            value = getattr(self, name)
+            require(type(value) is int, name, value, "a whole number")
+        require(0 <= self.seed < 2**31, "seed", self.seed, "in [0, 2^31)")
+        require(1 <= self.steps <= 10**12, "steps", self.steps, "in [1, 10^12]")
+        require(
+            self.checkpoint_every_updates >= 1, "checkpoint_every_updates", self.checkpoint_every_updates, "1 or more"
+        )
+        is_plain = (
+            isinstance(self.run, str) and "/" not in self.run and self.run not in (".", "..") and "\0" not in self.run
+        )
+        require(is_plain, "run", self.run, "a folder's name without slashes")
+        seen = ARCH_OBSERVATION[self.arch]
+        require(self.env.obs == seen, "env.obs", self.env.obs, f"{seen} for arch {self.arch}")
