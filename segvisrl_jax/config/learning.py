@@ -74,7 +74,7 @@ class PPOConfig:
     kl_stop: float = 0.03
     """A batch's epochs end early once the policy moved this far (approximate KL); 0 never stops."""
     bootstrap_on_timeout: bool = False
-    """Whether the value of the last state stands in for what the time limit cut off; else it is an end like any other."""
+    """Whether the last value stands in for what the time limit cut off; else it is an end like any other."""
 
     @property
     def decisions_per_update(self) -> int:

@@ -149,10 +149,10 @@ def summarize(finished: Finished, env: RoverEnv) -> dict[str, Any]:
     """Shares of the outcomes with their intervals, and the quality of the paths.
 
     Returns:
-        success, collision, fall, timeout, unstable: shares that sum to 1; success_ci95 and the other outcomes'
-        intervals (Wilson); spl (Anderson et al. 2018, against the shortest collision-free path); path_ratio (driven over
-        shortest, successful episodes); mean_time_s of successful episodes; min_clearance_m, the least distance to a rock's
-        centre over all episodes (None without rocks); mean_return.
+        success, collision, fall, timeout, unstable: shares that sum to 1, and their intervals (success_ci95 ...,
+        Wilson). spl: Anderson et al. 2018, against the shortest collision-free path. path_ratio: driven over
+        shortest, of successful episodes, as is mean_time_s. min_clearance_m: the least distance to a rock's centre
+        over all episodes (None without rocks). mean_return.
     """
     episodes = len(finished.outcome)
     summary: dict[str, Any] = {"episodes": episodes}
