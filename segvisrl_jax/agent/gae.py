@@ -47,9 +47,7 @@ def generalized_advantages(
     return advantages, advantages + values
 
 
-def _add_step(
-    later_advantage: Float32[Array, " B"], step: Rows
-) -> tuple[Float32[Array, " B"], Float32[Array, " B"]]:
+def _add_step(later_advantage: Float32[Array, " B"], step: Rows) -> tuple[Float32[Array, " B"], Float32[Array, " B"]]:
     delta, decay = step
     advantage = delta + decay * later_advantage
     return advantage, advantage

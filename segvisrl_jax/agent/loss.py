@@ -69,9 +69,7 @@ def clipped_surrogate_loss(
     return -jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
 
 
-def ppo_loss(
-    params: Params, batch: Batch, network: Network, config: PPOConfig
-) -> tuple[Float32[Array, ""], LossTerms]:
+def ppo_loss(params: Params, batch: Batch, network: Network, config: PPOConfig) -> tuple[Float32[Array, ""], LossTerms]:
     """The loss of a batch, and its parts.
 
     The approximate KL divergence from the old to the new policy is mean(ratio - 1 - log ratio).
@@ -135,7 +133,5 @@ def make_batch(
 def take_environments(batch: Batch, envs: Int32[Array, " N"]) -> Batch:
     """The part of a batch that belongs to some environments, whole in time."""
     carry = jax.tree.map(lambda part: part[envs], batch.carry)
-    rows = jax.tree.map(
-        lambda part: jnp.take(part, envs, axis=1), dataclasses.replace(batch, carry=())
-    )
+    rows = jax.tree.map(lambda part: jnp.take(part, envs, axis=1), dataclasses.replace(batch, carry=()))
     return dataclasses.replace(rows, carry=carry)

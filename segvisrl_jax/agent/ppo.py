@@ -176,9 +176,7 @@ class Learner:
         minibatches = order.reshape((num_epochs, self.config.num_minibatches, -1))
         return batch, minibatches.astype(jnp.int32), explained_variance
 
-    def _minibatch_step(
-        self, batch: Batch, progress: Progress, envs: Int32[Array, " N"]
-    ) -> tuple[Progress, None]:
+    def _minibatch_step(self, batch: Batch, progress: Progress, envs: Int32[Array, " N"]) -> tuple[Progress, None]:
         params = progress.state.params
 
         def add(total: Total, piece: Int32[Array, " chunk"]) -> tuple[Total, None]:
@@ -189,9 +187,7 @@ class Learner:
         return self._apply(progress, total), None
 
     @functools.partial(jax.jit, static_argnums=0)
-    def _add_chunk(
-        self, total: Total, params: Params, batch: Batch, envs: Int32[Array, " chunk"]
-    ) -> Total:
+    def _add_chunk(self, total: Total, params: Params, batch: Batch, envs: Int32[Array, " chunk"]) -> Total:
         """Adds the gradient and the loss terms of a few environments."""
         gradient_of = jax.value_and_grad(ppo_loss, has_aux=True)
         part = take_environments(batch, envs)
@@ -233,9 +229,7 @@ class Learner:
         return more & (progress.last_kl <= self.config.kl_stop)
 
     @functools.partial(jax.jit, static_argnums=0)
-    def _finish(
-        self, progress: Progress, explained_variance: Float32[Array, ""]
-    ) -> tuple[LearnerState, Metrics]:
+    def _finish(self, progress: Progress, explained_variance: Float32[Array, ""]) -> tuple[LearnerState, Metrics]:
         state = dataclasses.replace(progress.state, num_updates=progress.state.num_updates + 1)
         count = jnp.maximum(progress.num_applied, 1).astype(jnp.float32)
         means = jax.tree.map(lambda leaf: leaf / count, progress.terms_sum)

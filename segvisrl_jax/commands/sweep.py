@@ -86,10 +86,12 @@ def _train_one(asked: SweepOptions, arch: str, scale: float, seed: int) -> dict[
 
 
 def _scores(run_dir: Path) -> dict[str, Any]:
+    from segvisrl_jax.training.metrics import read_metrics
+
     result = json.loads((run_dir / "eval.json").read_text())
     low, high = result["success_ci95"]
-    lines = [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
-    decisions, seconds = lines[-1]["step"], lines[-1]["time/seconds"]
+    last = read_metrics(run_dir)[-1]
+    decisions, seconds = last["step"], last["time/seconds"]
     kept = {name: result[name] for name in ("success", "collision", "timeout", "spl")}
     return {**kept, "success_low": low, "success_high": high, "decisions_per_second": decisions / seconds}
 

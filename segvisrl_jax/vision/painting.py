@@ -29,9 +29,9 @@ class Columns:
     first: UInt16[Array, "*N rows"]
     count: UInt16[Array, "*N rows"]
 
-    def cover(self, columns: UInt16[Array, "columns"]) -> Bool[Array, "*N rows columns"]:
-        """Which of these columns are inside. One comparison: left of ``first``, uint16 wraps round."""
-        return (columns - self.first[..., None]) < self.count[..., None]
+    def cover(self, columns: UInt16[Array, "columns"]) -> Bool[Array, "rows columns"]:
+        """Which of these columns are inside one layer's span. One comparison: left of ``first``, uint16 wraps round."""
+        return (columns[None] - self.first[:, None]) < self.count[:, None]
 
 
 @struct.dataclass
@@ -140,9 +140,7 @@ def paint_solids(picture: Picture, solids: Solids, lines: Lines, surfaces: Surfa
         return jax.tree.map(lambda array: array[number], solids)
 
     loop = functools.partial(jax.lax.fori_loop, 0, len(solids.kind))
-    return jax.lax.platform_dependent(
-        picture, cpu=lambda p: loop(in_windows, p), default=lambda p: loop(everywhere, p)
-    )
+    return jax.lax.platform_dependent(picture, cpu=lambda p: loop(in_windows, p), default=lambda p: loop(everywhere, p))
 
 
 def _add_in_windows(
@@ -160,36 +158,26 @@ def _add_in_windows(
     def add_window(number: Array, picture: Picture) -> Picture:
         step = jnp.stack([number // count[1], number % count[1]])
         row, column = corner = tuple(jnp.minimum(start + step * jnp.array([height, width]), last))
-        part = jax.tree.map(
-            lambda image: jax.lax.dynamic_slice(image, corner, (height, width)), picture
-        )
+        part = jax.tree.map(lambda image: jax.lax.dynamic_slice(image, corner, (height, width)), picture)
         seen = lines.cut((row, column), (height, width))
         part = layer.cut_rows(row, height).add_to(part, seen, surfaces)
-        return jax.tree.map(
-            lambda image, new: jax.lax.dynamic_update_slice(image, new, corner), picture, part
-        )
+        return jax.tree.map(lambda image, new: jax.lax.dynamic_update_slice(image, new, corner), picture, part)
 
     return jax.lax.fori_loop(0, count[0] * count[1], add_window, picture)
 
 
 def _cut_rows(spans, row: Array, height: int):
-    return jax.tree.map(
-        lambda array: jax.lax.dynamic_slice_in_dim(array, row, height, axis=-1), spans
-    )
+    return jax.tree.map(lambda array: jax.lax.dynamic_slice_in_dim(array, row, height, axis=-1), spans)
 
 
-def _touched_windows(
-    span: Columns, lines: Lines, size: tuple[int, int]
-) -> tuple[Int32[Array, "2"], Int32[Array, "2"]]:
+def _touched_windows(span: Columns, lines: Lines, size: tuple[int, int]) -> tuple[Int32[Array, "2"], Int32[Array, "2"]]:
     """(first row and column of the image, windows down and across) that hold a span."""
     is_touched = span.count > 0
     far_column = np.uint16(np.iinfo(np.uint16).max)
     left = jnp.min(jnp.where(is_touched, span.first, far_column))
     right = jnp.max(jnp.where(is_touched, span.first + span.count, 0))
     first = jnp.array([jnp.argmax(is_touched), jnp.sum(lines.columns < left)])
-    last = jnp.array(
-        [is_touched.size - jnp.argmax(is_touched[::-1]), jnp.sum(lines.columns < right)]
-    )
+    last = jnp.array([is_touched.size - jnp.argmax(is_touched[::-1]), jnp.sum(lines.columns < right)])
     extent = jnp.where(jnp.any(is_touched), jnp.maximum(last - first, 0), 0)
     return first.astype(jnp.int32), -(-extent // jnp.array(size)).astype(jnp.int32)
 
@@ -211,8 +199,6 @@ def one_by_one_on_cpu(draw: Callable) -> Callable:
 
         args = jax.tree.map(batch, args, tuple(is_batched))
         on_cpu = functools.partial(jax.lax.map, lambda one: drawn(*one))
-        return jax.lax.platform_dependent(
-            args, cpu=on_cpu, default=lambda many: jax.vmap(draw)(*many)
-        ), True
+        return jax.lax.platform_dependent(args, cpu=on_cpu, default=lambda many: jax.vmap(draw)(*many)), True
 
     return drawn

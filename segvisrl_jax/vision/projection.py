@@ -30,9 +30,7 @@ Rasterisers move the ends of edges to a grid of 1/256 pixel, and a pixel whose c
 upper edge is outside. MuJoCo draws the ground in small squares, so its far edge is a chain of short,
 rounded edges: a row of pixels is outside already where the exact edge is half a grid step above its centres.
 """
-MIN_SUN_HEIGHT = (
-    1e-3  # sine of the least elevation at which shadows are still cast; config asks for 1 deg
-)
+MIN_SUN_HEIGHT = 1e-3  # sine of the least elevation at which shadows are still cast; config asks for 1 deg
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,9 +89,7 @@ class Stand:
     from_camera_m: Float32[Array, "3"]  # in the world frame
 
     @classmethod
-    def of(
-        cls, xy_m: Float32[Array, "2"], yaw_rad: Float32[Array, ""], camera: CameraPose
-    ) -> "Stand":
+    def of(cls, xy_m: Float32[Array, "2"], yaw_rad: Float32[Array, ""], camera: CameraPose) -> "Stand":
         """A solid on the ground."""
         cos, sin = jnp.cos(yaw_rad), jnp.sin(yaw_rad)
         turn = jnp.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])

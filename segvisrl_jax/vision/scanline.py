@@ -124,8 +124,8 @@ class ScanlineRenderer:
         """The shadows' spans, and the solids from far to near."""
         polyhedra, stand, shape = self._placed(scene, camera)
         sun = scene.sun_direction
-        shadows = jax.vmap(lambda *solid: shadow(*solid, sun, camera, self._projection))
-        shaded = jax.vmap(lambda *solid: faces(*solid, sun, camera, self._projection))
+        shadows = jax.vmap(lambda solid, place: shadow(solid, place, sun, camera, self._projection))
+        shaded = jax.vmap(lambda solid, place: faces(solid, place, sun, camera, self._projection))
         solids = Solids(
             span=self._outlines(polyhedra, stand, camera),
             faces=shaded(polyhedra, stand),
@@ -135,9 +135,7 @@ class ScanlineRenderer:
         solids = jax.tree.map(lambda array: array[far_to_near], solids)
         return self._columns_in(shadows(polyhedra, stand)), solids
 
-    def _placed(
-        self, scene: Scene, camera: CameraPose
-    ) -> tuple[Polyhedra, Stand, Int32[Array, "solids"]]:
+    def _placed(self, scene: Scene, camera: CameraPose) -> tuple[Polyhedra, Stand, Int32[Array, "solids"]]:
         """(shape, place, number in the library) of every rock and, last, of the goal."""
         xy, shape = self._xy_and_shape(scene)
         yaw = jnp.append(scene.rock_yaw_rad, scene.goal_yaw_rad)
@@ -158,15 +156,13 @@ class ScanlineRenderer:
         return self._columns_in(ground(self._map_size_m, camera, self._projection))
 
     def _outlines(self, polyhedra: Polyhedra, stand: Stand, camera: CameraPose) -> Columns:
-        outline = jax.vmap(lambda *solid: silhouette(*solid, camera, self._projection))
+        outline = jax.vmap(lambda solid, place: silhouette(solid, place, camera, self._projection))
         return self._columns_in(outline(polyhedra, stand))
 
     def _columns_in(self, sides: Sides) -> Columns:
         """The columns whose centres are in [left, right), in every wanted row."""
         width = self._projection.width_px
-        first, end = (
-            jnp.ceil(jnp.clip(u, 0.0, width) - 0.5) for u in spans(sides, self._lines().v_px)
-        )
+        first, end = (jnp.ceil(jnp.clip(u, 0.0, width) - 0.5) for u in spans(sides, self._lines().v_px))
         count = jnp.maximum(end - first, 0.0)
         return Columns(first=first.astype(jnp.uint16), count=count.astype(jnp.uint16))
 

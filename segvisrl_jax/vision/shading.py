@@ -25,12 +25,8 @@ STEP_X, STEP_Y, SEED_STEP, MIXER = 0x9E3779B1, 0x85EBCA77, 0x27D4EB2F, 0xC2B2AE3
 PART_BITS = 10  # three random numbers from one word
 MAX_CRATER_RADIUS = 0.4  # of its cell's side: craters of one size do not meet
 STAIN = 0.06  # how much lighter and darker the ground is where it is high and low, as a share
-FADE_PX = (
-    4.0  # a wave shorter than this many source pixels has faded out: downsampling would alias it
-)
-LOWEST_SLOPE = (
-    1e-4  # least steepness of a ray that meets the ground; flatter ones pass the far plane first
-)
+FADE_PX = 4.0  # a wave shorter than this many source pixels has faded out: downsampling would alias it
+LOWEST_SLOPE = 1e-4  # least steepness of a ray that meets the ground; flatter ones pass the far plane first
 LEAST_DISTANCE_M = 1e-6  # between the eye and a face's plane; faces seen from the edge have no area
 NEVER_SEEN = 1e9  # inverse depth of faces turned away
 
@@ -83,9 +79,7 @@ def ground_light(
     axes = camera_axes(camera)
     across = (u_px - projection.width_px / 2) / projection.focal_px
     down = (v_px - projection.height_px / 2) / projection.focal_px
-    x, y, z = (
-        axes[0, k] * across[None] + (axes[1, k] * down + axes[2, k])[:, None] for k in range(3)
-    )
+    x, y, z = (axes[0, k] * across[None] + (axes[1, k] * down + axes[2, k])[:, None] for k in range(3))
     depth = camera.position_m[2] / jnp.maximum(-z, LOWEST_SLOPE)
     x, y = camera.position_m[0] + depth * x, camera.position_m[1] + depth * y
     # One pixel's footprint along the line of sight, which is its longer side.
@@ -98,16 +92,13 @@ def ground_light(
         slope_x += strength * steepness * form[1]
         slope_y += strength * steepness * form[2]
     sun = sun_direction[2] - slope_x * sun_direction[0] - slope_y * sun_direction[1]
-    return jnp.maximum(sun, 0.0) * (sun_direction[2] > 0.0), 1.0 + STAIN * height
+    return jnp.where(sun_direction[2] > 0.0, jnp.maximum(sun, 0.0), 0.0), 1.0 + STAIN * height
 
 
 def _waves(x: Array, y: Array, seed: int) -> tuple[Array, Array, Array]:
     """Smooth noise in [-1, 1], a random value at every whole (x, y); and its two derivatives."""
     in_x, in_y, key = _cell(x, y, seed)
-    a, b, c, d = (
-        _random(key + np.uint32(corner))
-        for corner in (0, STEP_X, STEP_Y, (STEP_X + STEP_Y) % 2**32)
-    )
+    a, b, c, d = (_random(key + np.uint32(corner)) for corner in (0, STEP_X, STEP_Y, (STEP_X + STEP_Y) % 2**32))
     ease_x, ease_y = in_x * in_x * (3.0 - 2.0 * in_x), in_y * in_y * (3.0 - 2.0 * in_y)
     rate_x, rate_y = 6.0 * in_x * (1.0 - in_x), 6.0 * in_y * (1.0 - in_y)
     twist = a - b - c + d

@@ -126,9 +126,7 @@ def test_equal_to_brax_where_a_truncated_step_is_left_out(gae_lambda: float) -> 
     That is ours with the final value that makes its temporal difference 0: (V - r) / discount.
     """
     rollout = Rollout(seed=2)
-    brax_advantages, brax_targets = brax_gae(
-        rollout, rollout.truncated, rollout.terminated, gae_lambda
-    )
+    brax_advantages, brax_targets = brax_gae(rollout, rollout.truncated, rollout.terminated, gae_lambda)
     neutral = (rollout.values - rollout.rewards) / DISCOUNT
     advantages, targets = rollout.advantages(gae_lambda, truncation_values=neutral)
     np.testing.assert_allclose(targets, brax_targets, atol=1e-5)

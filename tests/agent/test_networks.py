@@ -56,10 +56,7 @@ def test_max_pool_is_that_of_flax(size: tuple[int, int]) -> None:
 
     np.testing.assert_array_equal(max_pool(images), flax_pool(images))
     weights = jnp.asarray(np.random.default_rng(1).normal(size=flax_pool(images).shape))
-    ours, theirs = (
-        jax.grad(lambda x, pool=pool: jnp.sum(pool(x) * weights))(images)
-        for pool in (max_pool, flax_pool)
-    )
+    ours, theirs = (jax.grad(lambda x, pool=pool: jnp.sum(pool(x) * weights))(images) for pool in (max_pool, flax_pool))
     np.testing.assert_allclose(ours, theirs, rtol=1e-5)
 
 

@@ -22,14 +22,10 @@ from segvisrl_jax.agent.networks import Network, make_network
 from segvisrl_jax.agent.ppo import Learner, LearnerState, default_chunk, make_learner
 from segvisrl_jax.config import ConfigError, NetworkConfig, PPOConfig
 
-SMALL = NetworkConfig(
-    channels=(4,), blocks_per_stage=1, feature_size=16, lstm_size=8, mlp_sizes=(8,)
-)
+SMALL = NetworkConfig(channels=(4,), blocks_per_stage=1, feature_size=16, lstm_size=8, mlp_sizes=(8,))
 IMAGE = (6, 8, 3)
 T, B = 5, 8
-CONFIG = PPOConfig(
-    num_envs=B, unroll_length=T, num_minibatches=2, num_epochs=3, kl_stop=0.0, discount=0.9
-)
+CONFIG = PPOConfig(num_envs=B, unroll_length=T, num_minibatches=2, num_epochs=3, kl_stop=0.0, discount=0.9)
 TOTAL_UPDATES = 10
 
 
@@ -65,22 +61,15 @@ def rollout(arch: str) -> tuple[LearnerState, Trajectory]:
         observation = jnp.asarray(rng.integers(0, 256, (T, B, *IMAGE), dtype=np.uint8))
     else:
         observation = jnp.asarray(rng.normal(size=(T, B, 3)), jnp.float32)
-    reset, terminated, truncated = (
-        jnp.asarray(rng.random((T, B)) < 0.3, jnp.float32) for _ in range(3)
-    )
-    first = tuple(
-        jnp.asarray(rng.normal(size=part.shape), jnp.float32)
-        for part in network.initial_carry((B,))
-    )
+    reset, terminated, truncated = (jnp.asarray(rng.random((T, B)) < 0.3, jnp.float32) for _ in range(3))
+    first = tuple(jnp.asarray(rng.normal(size=part.shape), jnp.float32) for part in network.initial_carry((B,)))
     carry, steps = first, []
     for t in range(T):
         key = jax.random.key(t)
         carry, *step = act(network, state.params, carry, observation[t], reset[t], key)
         steps.append(step)
     action, log_prob, value = (jnp.stack(rows) for rows in zip(*steps, strict=True))
-    reward, truncation_value = (
-        jnp.asarray(numbers, jnp.float32) for numbers in rng.normal(size=(2, T, B))
-    )
+    reward, truncation_value = (jnp.asarray(numbers, jnp.float32) for numbers in rng.normal(size=(2, T, B)))
     return state, Trajectory(
         observation=observation,
         action=action,
@@ -180,9 +169,7 @@ def test_a_time_limit_is_an_end_unless_bootstrapped(bootstrap: bool) -> None:
 
 def test_advantages_are_normalised_over_the_batch_and_targets_are_not() -> None:
     _, trajectory = rollout("mlp")
-    raw, explained = make_batch(
-        trajectory, jnp.ones(B), dataclasses.replace(CONFIG, normalize_advantage=False)
-    )
+    raw, explained = make_batch(trajectory, jnp.ones(B), dataclasses.replace(CONFIG, normalize_advantage=False))
     batch, _ = make_batch(trajectory, jnp.ones(B), CONFIG)
     shifted = (raw.advantage - raw.advantage.mean()) / raw.advantage.std()
     np.testing.assert_allclose(batch.advantage, shifted, atol=1e-5)
@@ -197,9 +184,7 @@ def test_advantages_are_normalised_over_the_batch_and_targets_are_not() -> None:
 
 def test_minibatches_cut_environments_and_never_time() -> None:
     _, trajectory = rollout("cnn_lstm")
-    batch, minibatches, _ = learner_of("cnn_lstm")._prepare(
-        trajectory, jnp.ones(B), jax.random.key(0)
-    )
+    batch, minibatches, _ = learner_of("cnn_lstm")._prepare(trajectory, jnp.ones(B), jax.random.key(0))
     assert minibatches.shape == (CONFIG.num_epochs, CONFIG.num_minibatches, B // 2)
     epochs = np.asarray(minibatches).reshape(CONFIG.num_epochs, B)
     np.testing.assert_array_equal(np.sort(epochs, axis=1), np.tile(np.arange(B), (3, 1)))
@@ -213,10 +198,7 @@ def test_minibatches_cut_environments_and_never_time() -> None:
 def test_both_executions_and_all_chunks_give_the_same_result() -> None:
     state, trajectory = rollout("cnn_lstm")
     variants = [("host", 4), ("host", 1), ("fused", 2)]
-    results = [
-        update(learner_of("cnn_lstm", execution, chunk), state, trajectory)
-        for execution, chunk in variants
-    ]
+    results = [update(learner_of("cnn_lstm", execution, chunk), state, trajectory) for execution, chunk in variants]
     for new_state, metrics in results[1:]:
         # Adam's step is rate * sign(gradient) where the gradient is tiny: compare against the rate.
         assert_close(new_state.params, results[0][0].params, atol=0.02 * CONFIG.learning_rate)

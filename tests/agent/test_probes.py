@@ -19,9 +19,7 @@ from segvisrl_jax.agent.networks import Network, make_network
 from segvisrl_jax.agent.ppo import make_learner
 from segvisrl_jax.config import NetworkConfig, PPOConfig
 
-NETWORK = NetworkConfig(
-    channels=(4,), blocks_per_stage=0, feature_size=16, lstm_size=16, mlp_sizes=(16,)
-)
+NETWORK = NetworkConfig(channels=(4,), blocks_per_stage=0, feature_size=16, lstm_size=16, mlp_sizes=(16,))
 NUM_ENVS, UNROLL_LENGTH, DISCOUNT = 32, 12, 0.9
 WHITE = 255
 
@@ -60,9 +58,7 @@ def drive(network: Network, probe: Probe, params, situation: Situation, key):
         action = policy.sample(key=act_key)
         ends = time == probe.length - 1
         new_cue = jax.random.bernoulli(cue_key, shape=cue.shape).astype(jnp.int32)
-        after = Situation(
-            jnp.where(ends, new_cue, cue), jnp.where(ends, jnp.zeros_like(time), time + 1), carry
-        )
+        after = Situation(jnp.where(ends, new_cue, cue), jnp.where(ends, jnp.zeros_like(time), time + 1), carry)
         rows = (observation, action, policy.log_prob(action), output.value)
         return after, (*rows, reward(cue, time, action), ends.astype(jnp.float32), begins)
 
@@ -168,9 +164,7 @@ RECALL = Probe(
     # The cue is shown at the first step only; then nothing, whatever it was.
     observe=lambda cue, time: pixel(lit=time == 0, column=1 + 3 * cue),
     # At the last step: +1 for a left wheel above half speed after cue 1, or below it after cue 0.
-    reward=lambda cue, time, action: jnp.where(
-        time < 3, 0.0, jnp.where((action[0] > 0.5) == (cue == 1), 1.0, -1.0)
-    ),
+    reward=lambda cue, time, action: jnp.where(time < 3, 0.0, jnp.where((action[0] > 0.5) == (cue == 1), 1.0, -1.0)),
 )
 
 
