@@ -4,6 +4,8 @@ How the loss is minimised is in ppo.py.
 """
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,11 +20,15 @@ from segvisrl_jax.config import PPOConfig
 TINY = 1e-8  # keeps a division by a standard deviation or a variance finite
 
 
+Draw = Callable[[Any], Shaped[Array, "T B ..."]]
+"""Makes observations (T, B, ...) from whatever a trajectory holds in their place."""
+
+
 @struct.dataclass
 class Trajectory:
     """T decisions of B environments, and the carry before the first one."""
 
-    observation: Shaped[Array, "T B ..."]
+    observation: Any  # Shaped[Array, "T B ..."], or a pytree (T, B, ...) that the learner's ``draw`` makes one from
     action: Float32[Array, "T B 2"]  # as sampled, before the environment clips it
     log_prob: Float32[Array, "T B"]  # of that action, when it was taken
     value: Float32[Array, "T B"]
@@ -38,7 +44,7 @@ class Trajectory:
 class Batch:
     """What the loss reads of a trajectory."""
 
-    observation: Shaped[Array, "T B ..."]
+    observation: Any  # as in the trajectory
     action: Float32[Array, "T B 2"]
     log_prob: Float32[Array, "T B"]
     advantage: Float32[Array, "T B"]
@@ -69,12 +75,15 @@ def clipped_surrogate_loss(
     return -jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
 
 
-def ppo_loss(params: Params, batch: Batch, network: Network, config: PPOConfig) -> tuple[Float32[Array, ""], LossTerms]:
+def ppo_loss(
+    params: Params, batch: Batch, network: Network, config: PPOConfig, draw: Draw | None = None
+) -> tuple[Float32[Array, ""], LossTerms]:
     """The loss of a batch, and its parts.
 
     The approximate KL divergence from the old to the new policy is mean(ratio - 1 - log ratio).
     """
-    _, output = network.unroll(params, batch.carry, batch.observation, batch.reset)
+    observation = batch.observation if draw is None else draw(batch.observation)
+    _, output = network.unroll(params, batch.carry, observation, batch.reset)
     distribution = DiagonalGaussian(output.mean, output.log_std)
     log_ratio = distribution.log_prob(batch.action) - batch.log_prob
     ratio = jnp.exp(log_ratio)

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float32, Int32
 
 from segvisrl_jax.agent.loss import (
     Batch,
+    Draw,
     LossTerms,
     Trajectory,
     make_batch,
@@ -95,6 +96,7 @@ class Learner:
     optimizer: optax.GradientTransformation
     execution: Literal["host", "fused"]
     chunk: int
+    draw: Draw | None = None
 
     def init(self, key: Key) -> LearnerState:
         """Fresh parameters and optimiser state."""
@@ -191,7 +193,7 @@ class Learner:
         """Adds the gradient and the loss terms of a few environments."""
         gradient_of = jax.value_and_grad(ppo_loss, has_aux=True)
         part = take_environments(batch, envs)
-        (_, terms), gradient = gradient_of(params, part, self.network, self.config)
+        (_, terms), gradient = gradient_of(params, part, self.network, self.config, self.draw)
         return jax.tree.map(jnp.add, total, (gradient, terms))
 
     @functools.partial(jax.jit, static_argnums=0)
@@ -253,6 +255,7 @@ def make_learner(
     total_updates: int,
     execution: str = "auto",
     chunk: int | None = None,
+    draw: Draw | None = None,
 ) -> Learner:
     """The learner of a network.
 
@@ -263,6 +266,7 @@ def make_learner(
         execution: host or fused (see the module); auto takes host for convolutions on a CPU.
         chunk: environments in one piece of a minibatch's gradient; ``default_chunk`` where None.
             It changes speed and memory, and the result by rounding only.
+        draw: makes the observations of a piece from what the trajectory holds in their place; None where it holds them.
 
     Raises:
         ConfigError: for settings out of range.
@@ -285,7 +289,7 @@ def make_learner(
         optax.clip_by_global_norm(config.max_gradient_norm),
         optax.adam(schedule, eps=ADAM_EPSILON),
     )
-    return Learner(network, config, schedule, optimizer, kind, chunk)
+    return Learner(network, config, schedule, optimizer, kind, chunk, draw)
 
 
 def _start_progress(state: LearnerState) -> Progress:

@@ -1,6 +1,7 @@
 """``segvisrl train``: one training run and everything that it leaves behind."""
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ def run(options: Sequence[str]) -> int:
 
     if not config.resume:
         print(differences_from_paper(config))
+        print(observation_memory(config))
     result = train(config)
     resume = f"segvisrl train --resume --runs-dir {config.runs_dir} --run {config.run_name}"
     if not result.finished:
@@ -92,6 +94,18 @@ def differences_from_paper(config: TrainConfig) -> str:
     if not rows:
         return title + "the paper's settings."
     return "\n".join([title + "differs from the paper's settings in", *rows])
+
+
+def observation_memory(config: TrainConfig) -> str:
+    """One line: what the observations of a batch take, so that nobody finds out by running out."""
+    from segvisrl_jax.commands.eval import observation_shape
+
+    shape = observation_shape(config)
+    size = math.prod(shape) * (4 if config.env.obs == "state" else 1)
+    total = size * config.ppo.decisions_per_update / 1e6
+    if config.ppo.redraw_observations:
+        return f"  observations: {total:,.1f} MB a batch, drawn again when needed (not stored)"
+    return f"  observations: {total:,.1f} MB a batch, stored"
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:

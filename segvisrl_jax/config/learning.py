@@ -73,6 +73,8 @@ class PPOConfig:
     """Advantages of a batch are shifted and scaled to mean 0, deviation 1."""
     kl_stop: float = 0.03
     """A batch's epochs end early once the policy moved this far (approximate KL); 0 never stops."""
+    redraw_observations: bool = False
+    """Keep scenes and poses in place of images and draw these again in every epoch: less memory, more rendering."""
     bootstrap_on_timeout: bool = False
     """Whether the last value stands in for what the time limit cut off; else it is an end like any other."""
 

@@ -4,7 +4,7 @@ from typing import Literal
 
 Arch = Literal["cnn_lstm", "cnn", "cnn_lstm_raw", "mlp"]
 ObservationKind = Literal["segmentation", "rgb", "state"]
-RendererName = Literal["auto", "scanline", "gl"]
+RendererName = Literal["auto", "scanline", "gl", "warp"]
 EngineName = Literal["auto", "native", "mjx"]
 PresetName = Literal["paper", "cpu", "gpu", "smoke"]
 

@@ -64,7 +64,8 @@ class Trainer:
         self.config = config
         env = RoverEnv(config.env)
         self.network: Network = make_network(config.arch, config.network, env.observation_shape)
-        self.learner: Learner = make_learner(self.network, config.ppo, config.num_updates)
+        draw = jax.vmap(jax.vmap(env.observe)) if config.ppo.redraw_observations else None
+        self.learner: Learner = make_learner(self.network, config.ppo, config.num_updates, draw=draw)
         self.batch = BatchEnv(env, config.ppo.num_envs)
         self.policy: Policy = network_policy(self.network, config.arch)
         self.evaluator = Evaluator(RoverEnv(held_out_env(config.env)), self.policy, config.evaluation.num_slots)

@@ -61,7 +61,7 @@ def unroll(
 
 def _decide(
     params: Any, actor: ActorState, env: BatchEnv, network: Network, config: PPOConfig
-) -> tuple[ActorState, tuple[dict[str, Array], EpisodeLog]]:
+) -> tuple[ActorState, tuple[dict[str, Any], EpisodeLog]]:
     next_key, action_key = jax.random.split(actor.key)
     observation = env.observe(actor.env)
     carry, output = network.step(params, actor.carry, observation, actor.env.is_first)
@@ -69,7 +69,7 @@ def _decide(
     action = distribution.sample(key=action_key)
     after, step = env.step(actor.env, action)
     kept = {
-        "observation": observation,
+        "observation": actor.env.rover if config.redraw_observations else observation,
         "action": action,
         "log_prob": distribution.log_prob(action),
         "value": output.value,

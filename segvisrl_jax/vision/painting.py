@@ -4,6 +4,7 @@ Where a solid's faces are shaded depends on the machine. A GPU shades every pixe
 would be most of the work for little of the image, so only the windows that a solid touches are shaded.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 
@@ -67,7 +68,10 @@ class Picture:
     kind: UInt8[Array, "rows columns"]
 
     def cover(
-        self, where: Bool[Array, "rows columns"], light: Float32[Array, "rows columns"], kind: Array
+        self,
+        where: Bool[Array, "rows columns"],
+        light: Float32[Array, "rows columns"],
+        kind: Array | np.uint8 | np.uint8,
     ) -> "Picture":
         """The picture with something in front of it."""
         return Picture(jnp.where(where, light, self.light), jnp.where(where, kind, self.kind))
@@ -94,7 +98,7 @@ class Ground:
     def cut_rows(self, row: Array, height: int) -> "Ground":
         """The same in fewer rows."""
         span, shadows = _cut_rows((self.span, self.shadows), row, height)
-        return self.replace(span=span, shadows=shadows)
+        return dataclasses.replace(self, span=span, shadows=shadows)
 
 
 @struct.dataclass
@@ -112,7 +116,7 @@ class Solids:
 
     def cut_rows(self, row: Array, height: int) -> "Solids":
         """The same in fewer rows."""
-        return self.replace(span=_cut_rows(self.span, row, height))
+        return dataclasses.replace(self, span=_cut_rows(self.span, row, height))
 
 
 def paint_ground(ground: Ground, lines: Lines, surfaces: Surfaces) -> Picture:

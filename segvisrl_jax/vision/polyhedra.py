@@ -3,6 +3,8 @@
 Worked out once, with NumPy, from the plain ``ConvexSolids``. Nothing here is projected or drawn.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,20 +35,17 @@ class Polyhedra:
     @classmethod
     def from_solids(cls, solids: ConvexSolids) -> "Polyhedra":
         """Adds the faces' planes and the neighbourhood of faces and edges."""
-        parts = [_faces_and_sides(solids, index) for index in range(len(solids.num_faces))]
-        return cls(
-            vertices_m=np.asarray(solids.vertices_m, np.float32),
-            edges=np.asarray(solids.edges, np.int32),
-            **{name: np.stack([part[name] for part in parts]) for name in parts[0]},
-        )
+        parts = [_fields(solids, index) for index in range(len(solids.num_faces))]
+        fields: dict[str, Any] = {name: np.stack([part[name] for part in parts]) for name in parts[0]}
+        return cls(**fields)
 
     def take(self, index: Int32[Array, "*K"]) -> "Polyhedra":
         """The polyhedra with these numbers."""
         return jax.tree.map(lambda array: jnp.asarray(array)[index], self)
 
 
-def _faces_and_sides(solids: ConvexSolids, index: int) -> dict[str, np.ndarray]:
-    """The fields that ``Polyhedra`` adds, for one solid, padded like the library."""
+def _fields(solids: ConvexSolids, index: int) -> dict[str, np.ndarray]:
+    """The fields of ``Polyhedra`` for one solid, padded like the library."""
     vertices, edges = solids.vertices_m[index].astype(np.float64), solids.edges[index]
     num_faces, max_faces = int(solids.num_faces[index]), solids.faces.shape[1]
     number = {tuple(edge): e for e, edge in enumerate(edges.tolist()) if edge[0] != edge[1]}
@@ -62,6 +61,8 @@ def _faces_and_sides(solids: ConvexSolids, index: int) -> dict[str, np.ndarray]:
         normals[face] = normal / np.linalg.norm(normal)
         offsets[face] = normals[face] @ vertices[a]
     return {
+        "vertices_m": np.asarray(solids.vertices_m[index], np.float32),
+        "edges": edges.astype(np.int32),
         "edge_faces": np.array([faces or [0, 0] for faces in edge_faces], np.int32),
         "face_edges": face_edges,
         "face_is_real": np.arange(max_faces) < num_faces,

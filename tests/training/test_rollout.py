@@ -10,6 +10,7 @@ import pytest
 import segvisrl_jax
 from segvisrl_jax.agent.distributions import DiagonalGaussian
 from segvisrl_jax.agent.networks import make_network
+from segvisrl_jax.agent.ppo import make_learner
 from segvisrl_jax.config import NetworkConfig, PPOConfig
 from segvisrl_jax.env.wrappers import BatchEnv
 from segvisrl_jax.training.rollout import start_acting, unroll
@@ -63,3 +64,20 @@ def test_rewards_are_scaled_and_episodes_logged(parts):
     ended = np.asarray(trajectory.terminated) + np.asarray(trajectory.truncated) > 0
     assert np.array_equal(ended, np.asarray(log.outcome) != 0)
     assert np.array_equal(ended[:-1], np.asarray(trajectory.reset)[1:] > 0)
+
+
+def test_drawing_again_gives_the_update_that_storing_gives(parts):
+    """Scenes and poses in place of images: the same parameters after an update."""
+    env, network = parts
+    updated = []
+    for again in (False, True):
+        config = PPOConfig(num_envs=4, unroll_length=12, num_minibatches=2, num_epochs=2, redraw_observations=again)
+        _, _, trajectory, last_value, _ = roll(parts, config)
+        draw = jax.vmap(jax.vmap(env.env.observe)) if again else None
+        learner = make_learner(network, config, total_updates=1, draw=draw)
+        state = learner.init(jax.random.key(1))
+        after, _ = learner.update(state, trajectory, last_value, jax.random.key(3))
+        updated.append(after.params)
+        assert hasattr(trajectory.observation, "scene") == again
+    for stored, drawn in zip(*map(jax.tree.leaves, updated), strict=True):
+        np.testing.assert_allclose(drawn, stored, atol=1e-6)
