@@ -32,6 +32,12 @@ class BenchOptions:
     parts: tuple[Part, ...] = ("physics", "render", "train")
     batch: int = 32
     """Environments at once."""
+    batches: tuple[int, ...] = (1, 16, 64, 256)
+    """Frames at once, for the renderers."""
+    scale: float = 10.0
+    """Downsampling of the 1920 x 1080 image, for the renderers (paper: 10)."""
+    num_rocks: int = 4
+    """Rocks in the renderers' scenes."""
     repeats: int = 5
     arch: Arch = "cnn_lstm"
     preset: PresetName = "cpu"
@@ -42,6 +48,8 @@ class BenchOptions:
 
     def __post_init__(self) -> None:
         require(1 <= self.batch <= 65536, "--batch", self.batch, "in [1, 65536]")
+        for batch in self.batches:
+            require(1 <= batch <= 65536, "--batches", batch, "in [1, 65536]")
         require(1 <= self.repeats <= 1000, "--repeats", self.repeats, "in [1, 1000]")
 
 
@@ -102,25 +110,25 @@ def _physics(asked: BenchOptions):
 
 
 def _render(asked: BenchOptions):
+    """Frames a second of each renderer on the same scenes, and the ratio to the first one that is MuJoCo's (gl)."""
+    config = replace_fields(preset_config("cnn_lstm", asked.preset).env, scale=asked.scale, num_rocks=asked.num_rocks)
+    environments = {name: _env_or_none(replace_fields(config, renderer=name)) for name in asked.renderers}
+    for batch in asked.batches:
+        rows = [_render_row(name, env, batch, asked) for name, env in environments.items() if env is not None]
+        reference = next((row["frames_per_s"] for row in rows if row["name"] == "gl"), None)
+        for row in rows:
+            yield row if reference is None else {**row, "ratio_to_gl": row["frames_per_s"] / reference}
+
+
+def _render_row(name: str, env: Any, batch: int, asked: BenchOptions) -> dict[str, Any]:
     import jax
 
-    config = preset_config("cnn_lstm", asked.preset).env
-    for scale in (10.0, config.camera.scale):
-        for renderer in asked.renderers:
-            env = _env_or_none(replace_fields(config, renderer=renderer, scale=scale))
-            if env is None:
-                continue
-            rover = jax.jit(jax.vmap(env.initial_state))(jax.random.split(jax.random.key(0), asked.batch))
-            observe = jax.jit(jax.vmap(env.observe))
-            compile_s, seconds = _time(functools.partial(observe, rover), asked.repeats)
-            rows, columns, _ = env.observation_shape
-            yield {
-                "name": renderer,
-                "image": f"{columns} x {rows}",
-                "batch": asked.batch,
-                "frames_per_s": asked.batch / seconds,
-                "compile_s": compile_s,
-            }
+    rover = jax.jit(jax.vmap(env.initial_state))(jax.random.split(jax.random.key(0), batch))
+    compile_s, seconds = _time(functools.partial(jax.jit(jax.vmap(env.observe)), rover), asked.repeats)
+    rows, columns, _ = env.observation_shape
+    source = f"{env.config.camera.width_px} x {env.config.camera.height_px}"
+    row = {"name": name, "image": f"{source} to {columns} x {rows}", "rocks": asked.num_rocks, "batch": batch}
+    return {**row, "frames_per_s": batch / seconds, "compile_s": compile_s}
 
 
 def _train(asked: BenchOptions):

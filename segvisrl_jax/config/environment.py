@@ -206,7 +206,8 @@ class EnvConfig:
     obs: ObservationKind = "segmentation"
     """segmentation: four classes, coloured and shrunk; rgb: colour, only shrunk; state: a vector, no camera."""
     renderer: RendererName = "auto"
-    """scanline: in the compiled program; gl: MuJoCo's own renderer, behind a callback; auto: scanline where it can."""
+    """scanline: in the compiled program; gl: MuJoCo's own renderer, behind a callback; warp: MuJoCo Warp's ray caster,
+    a call out of the program, needs segvisrl_jax[warp]; auto: scanline where it can."""
     scene: SceneConfig = field(default_factory=SceneConfig)
     task: TaskConfig = field(default_factory=TaskConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)

@@ -19,17 +19,13 @@ from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 
 from segvisrl_jax.config import CameraConfig
+from segvisrl_jax.env.model import GROUND_GRID_M
 from segvisrl_jax.types import CameraPose
 from segvisrl_jax.vision.polyhedra import Polyhedra
 
 NO_CROSSING_PX = 1e9  # where a span starts, and minus where it ends, in a row without a crossing
-GROUND_FAR_SHIFT_PX = 1 / 512
-"""How much lower OpenGL draws the ground's far edge where it is all but level.
-
-Rasterisers move the ends of edges to a grid of 1/256 pixel, and a pixel whose centre is then right on an
-upper edge is outside. MuJoCo draws the ground in small squares, so its far edge is a chain of short,
-rounded edges: a row of pixels is outside already where the exact edge is half a grid step above its centres.
-"""
+VERTEX_GRID_PX = 1 / 256  # rasterisers move the ends of edges to a grid this fine
+LEAST_DIVISOR = 1e-6  # a camera that looks straight up or down has no horizon
 MIN_SUN_HEIGHT = 1e-3  # sine of the least elevation at which shadows are still cast; config asks for 1 deg
 
 
@@ -42,13 +38,15 @@ class Projection:
     focal_px: float
     near_m: float
     far_m: float
+    far_piece_px: float  # how long a square of MuJoCo's ground is in the image where it passes the far plane
 
     @classmethod
     def from_config(cls, camera: CameraConfig) -> "Projection":
         """Square pixels, principal point in the middle."""
         focal = camera.width_px / 2 / math.tan(math.radians(camera.horizontal_fov_deg) / 2)
         far = _drawn_far_m(camera)
-        return cls(camera.width_px, camera.height_px, focal, camera.near_m, far)
+        piece = 2.0 * GROUND_GRID_M * focal / far
+        return cls(camera.width_px, camera.height_px, focal, camera.near_m, far, piece)
 
     def to_image(self, points_m: Float32[Array, "*P 3"]) -> Float32[Array, "*P 2"]:
         """(u, v) of points in the camera frame; nearer than the near plane, finite nonsense."""
@@ -123,6 +121,7 @@ def silhouette(solid: Polyhedra, stand: Stand, camera: CameraPose, projection: P
         far_cut & solid.face_is_real & is_turned_to_us,
     ]
     sides = jnp.concatenate([ends, near_ends, far_ends])
+    sides = jnp.round(sides / VERTEX_GRID_PX) * VERTEX_GRID_PX
     return _sides(*_compact(sides, jnp.concatenate(is_side), max_sides(solid)))
 
 
@@ -157,7 +156,24 @@ def ground(map_size_m: float, camera: CameraPose, projection: Projection) -> Sid
     edges = np.array([[1, 0], [1, 2], [3, 2], [3, 4], [5, 4], [5, 6], [7, 6], [7, 0]], np.int32)
     points = rotate(camera_axes(camera), loop_m - camera.position_m)
     is_seen = jnp.broadcast_to(camera.position_m[2] > 0.0, len(edges))
-    return _sides(*_flat_polygon(points, edges, is_seen, projection, GROUND_FAR_SHIFT_PX))
+    return _sides(*_flat_polygon(points, edges, is_seen, projection, _far_shift_px(camera, projection)))
+
+
+def _far_shift_px(camera: CameraPose, projection: Projection) -> Float32[Array, ""]:
+    """How much lower OpenGL draws the ground's far edge where it is all but level.
+
+    MuJoCo draws the ground in squares, so its far edge is a chain of pieces. Their ends are rounded to the
+    rasteriser's grid, and a pixel whose centre is then right on a level piece is outside. So a row of pixels is
+    outside already where the exact edge is up to half a grid step above its centres. The steeper the edge, the
+    fewer pieces become level; once each rises by a step, rounding goes either way.
+    """
+    slope = jnp.abs(camera.rotation[2, 0] / _away_from_zero(camera.rotation[2, 1]))
+    level_share = jnp.maximum(1.0 - slope * projection.far_piece_px / VERTEX_GRID_PX, 0.0)
+    return level_share * (VERTEX_GRID_PX / 2)
+
+
+def _away_from_zero(number: Float32[Array, ""]) -> Float32[Array, ""]:
+    return jnp.where(jnp.abs(number) < LEAST_DIVISOR, LEAST_DIVISOR, number)
 
 
 def spans(
@@ -201,7 +217,7 @@ def _clip(
     points_m: Float32[Array, "V 3"],
     edges: Int32[Array, "E 2"] | Int32[np.ndarray, "E 2"],
     projection: Projection,
-    far_shift_v_px: float = 0.0,
+    far_shift_v_px: Float32[Array, ""] | float = 0.0,
 ) -> tuple[Float32[Array, "E 2 2"], Bool[Array, "E"], _Cuts]:
     """(ends of each edge in the image after clipping, whether anything is left of it, where it was cut).
 
@@ -211,7 +227,7 @@ def _clip(
     depth = ends[..., 2]
     near, is_near = _intersect(ends, projection.near_m, projection)
     far, is_far = _intersect(ends, projection.far_m, projection)
-    far = far + jnp.array([0.0, far_shift_v_px], jnp.float32)
+    far = far.at[:, 1].add(far_shift_v_px)
     image = projection.to_image(points_m)[edges]
     image = jnp.where((depth < projection.near_m)[..., None], near[:, None], image)
     image = jnp.where((depth > projection.far_m)[..., None], far[:, None], image)
@@ -245,7 +261,7 @@ def _flat_polygon(
     edges: Int32[Array, "E 2"] | Int32[np.ndarray, "E 2"],
     is_outline: Bool[Array, "E"],
     projection: Projection,
-    far_shift_v_px: float,
+    far_shift_v_px: Float32[Array, ""] | float,
 ) -> tuple[Float32[Array, "K 2 2"], Bool[Array, "K"]]:
     """The sides of one flat convex polygon's image: its clipped edges and the two planes' cuts."""
     ends, is_left, cuts = _clip(points_m, edges, projection, far_shift_v_px)

@@ -1,11 +1,12 @@
 """What a renderer must do: answer for the pixels of the source image that downsampling reads."""
 
+from importlib.util import find_spec
 from typing import Protocol
 
 import numpy as np
 from jaxtyping import Array, Int, UInt8
 
-from segvisrl_jax.config import EnvConfig
+from segvisrl_jax.config import EnvConfig, require
 from segvisrl_jax.types import CameraPose, Scene
 
 
@@ -27,9 +28,7 @@ class Renderer(Protocol):
         ...
 
 
-def make_renderer(
-    config: EnvConfig, rows: Int[np.ndarray, "rows"], columns: Int[np.ndarray, "columns"]
-) -> Renderer:
+def make_renderer(config: EnvConfig, rows: Int[np.ndarray, "rows"], columns: Int[np.ndarray, "columns"]) -> Renderer:
     """The renderer that ``config.renderer`` names, for these rows and columns of the source image.
 
     ``auto`` takes ``scanline``, which needs no OpenGL.
@@ -41,6 +40,12 @@ def make_renderer(
         from segvisrl_jax.vision.gl import GlRenderer
 
         return GlRenderer(config, rows, columns)
+    if config.renderer == "warp":
+        should = "'scanline' where Warp is not installed; pip install 'segvisrl_jax[warp]' installs it"
+        require(find_spec("warp") is not None, "env.renderer", config.renderer, should)
+        from segvisrl_jax.vision.warp import WarpRenderer
+
+        return WarpRenderer(config, rows, columns)
     from segvisrl_jax.vision.scanline import ScanlineRenderer
 
     return ScanlineRenderer(config, rows, columns)

@@ -121,8 +121,8 @@ class Solids:
         rotation = jnp.einsum("nij,njk->nik", body, jnp.asarray(self.turn)[shape], precision=EXACT)
         shown = np.append(self.geom[:num_rocks], self.geom[-1])
         return World(
-            geom_position_m=jnp.zeros((num_geoms, 3)).at[shown].set(position.at[:, :2].add(xy)),
-            geom_rotation=jnp.tile(jnp.eye(3), (num_geoms, 1, 1)).at[shown].set(rotation),
+            geom_position_m=jnp.zeros((num_geoms, 3), jnp.float32).at[shown].set(position.at[:, :2].add(xy)),
+            geom_rotation=jnp.tile(jnp.eye(3, dtype=jnp.float32), (num_geoms, 1, 1)).at[shown].set(rotation),
             geom_mesh=jnp.asarray(self.mesh_of_geom).at[shown].set(jnp.asarray(self.mesh)[shape]),
             camera_position_m=camera.position_m[None],
             camera_rotation=camera.rotation[None],

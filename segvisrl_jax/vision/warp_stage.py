@@ -63,13 +63,20 @@ class Stage:
         """What each ray sees, four bytes in one number. A batch; cannot be vmapped."""
         return self._call(_cast_colours, worlds)
 
-    def canvas(self, num_worlds: int, num_rocks: int, is_rgb: bool) -> "Canvas":
-        """The canvas for a batch on Warp's current device."""
+    def cast(self, world: tuple, num_rocks: int, **output: Any) -> None:
+        """Casts the rays of a batch, on Warp's current device.
+
+        Args:
+            world: the leaves of a ``World``, in order, as Warp's arrays.
+            num_rocks: its last field.
+            **output: the array to fill, as ``seg_data`` or as ``rgb_data``.
+        """
+        num_worlds, is_rgb = world[0].shape[0], "rgb_data" in output
         key = (warp.get_device().alias, num_worlds, num_rocks, is_rgb)
         if key not in self._canvases:
             model = _showing(self._model, num_rocks)
             self._canvases[key] = Canvas(model, self._rays, self._size_px, num_worlds, is_rgb)
-        return self._canvases[key]
+        self._canvases[key].cast(world, **output)
 
     def _call(self, cast: Callable, worlds: World) -> Array:
         if warp.config.log_level == warp.LOG_INFO:
@@ -112,12 +119,7 @@ class Canvas:
         self._context.ray.assign(rays)  # in place of those of an evenly spaced image
 
     def cast(self, world: tuple, **output: Any) -> None:
-        """Fits the tree to the worlds and casts the rays, into Warp's ``seg_data`` or ``rgb_data``.
-
-        Args:
-            world: the leaves of a ``World``, in order, as Warp's arrays.
-            **output: the one that is drawn.
-        """
+        """Fits the tree to the worlds and casts the rays."""
         model, data, context = self._model, self._data, self._context
         data.geom_xpos, data.geom_xmat, model.geom_dataid, data.cam_xpos, data.cam_xmat, data.light_xdir = world
         for name, array in output.items():
@@ -150,8 +152,7 @@ def _cast_hits(
     hits: warp.array2d[warp.vec2i],
 ):
     """What compiled programs call, one call at a time; Warp holds a lock. The first six are a ``World``'s leaves."""
-    canvas = _stage(stage).canvas(position.shape[0], num_rocks, is_rgb=False)
-    canvas.cast((position, rotation, mesh, eye, look, light), seg_data=hits)
+    _stage(stage).cast((position, rotation, mesh, eye, look, light), num_rocks, seg_data=hits)
 
 
 def _cast_colours(
@@ -166,8 +167,7 @@ def _cast_colours(
     colours: warp.array2d[warp.uint32],
 ):
     """As ``_cast_hits``, for colours."""
-    canvas = _stage(stage).canvas(position.shape[0], num_rocks, is_rgb=True)
-    canvas.cast((position, rotation, mesh, eye, look, light), rgb_data=colours)
+    _stage(stage).cast((position, rotation, mesh, eye, look, light), num_rocks, rgb_data=colours)
 
 
 def _showing(model: mujoco.MjModel, num_rocks: int) -> mujoco.MjModel:
