@@ -134,7 +134,7 @@ class PhysicsConfig:
 
     engine: EngineName = "auto"
     """native: MuJoCo C on a pool of threads; mjx: MJX, on the device; auto: mjx on an accelerator, else native."""
-    timestep_s: float = 0.04
+    timestep_s: float = 0.05
     """MuJoCo's own time step; it divides task.judge_dt_s."""
     gravity_m_s2: float = 1.62
     """The Moon's."""

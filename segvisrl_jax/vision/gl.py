@@ -90,9 +90,7 @@ class GlRenderer:
         if self._thread is not None:
             self._thread.close()
 
-    def _callback(
-        self, draw: Callable, shape: tuple[int, ...], scene: Scene, camera: CameraPose
-    ) -> Array:
+    def _callback(self, draw: Callable, shape: tuple[int, ...], scene: Scene, camera: CameraPose) -> Array:
         self._open()
         result = jax.ShapeDtypeStruct(shape, np.uint8)
         return jax.pure_callback(draw, result, scene, camera, vmap_method="broadcast_all")
@@ -111,9 +109,7 @@ class GlRenderer:
         weakref.finalize(self, thread.close).atexit = False
         self._canvas, self._thread = canvas, thread
 
-    def _draw_classes(
-        self, scene: Scene, camera: CameraPose
-    ) -> UInt8[np.ndarray, "*B rows columns"]:
+    def _draw_classes(self, scene: Scene, camera: CameraPose) -> UInt8[np.ndarray, "*B rows columns"]:
         return self._draw(scene, camera, self._fill_classes, self._size)
 
     def _draw_rgb(self, scene: Scene, camera: CameraPose) -> UInt8[np.ndarray, "*B rows columns 3"]:
@@ -153,9 +149,7 @@ class Canvas:
         model = build_model(config)
         names = [model.geom(geom).name for geom in range(model.ngeom)]
         self._class_of_geom = np.array([_class_of(name) for name in names])
-        self._rocks = np.array(
-            [names.index(f"rock{i}") for i in range(config.scene.num_rock_shapes)]
-        )
+        self._rocks = np.array([names.index(f"rock{i}") for i in range(config.scene.num_rock_shapes)])
         self._goal = names.index("goal")
         model.geom_group[:] = np.where(self._class_of_geom > 0, SHOWN_GROUP, HIDDEN_GROUP)
         self._model = model
@@ -215,9 +209,7 @@ class Canvas:
         data.light_xdir[self._sun] = -sun
         data.light_xpos[self._sun] = shaded + SUN_DISTANCE_M * sun
         everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(
-            model, data, self._options, None, self._camera, everything, self._scene
-        )
+        mujoco.mjv_updateScene(model, data, self._options, None, self._camera, everything, self._scene)
 
     def _stand(
         self,

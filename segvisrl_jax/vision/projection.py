@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float32, Int32
+from jaxtyping import Array, Bool, Float32, Float64, Int32
 
 from segvisrl_jax.config import CameraConfig
 from segvisrl_jax.env.model import GROUND_GRID_M
@@ -24,6 +24,7 @@ from segvisrl_jax.types import CameraPose
 from segvisrl_jax.vision.polyhedra import Polyhedra
 
 NO_CROSSING_PX = 1e9  # where a span starts, and minus where it ends, in a row without a crossing
+MUJOCO_MAX_SQUARES = 198  # mjMAXPLANEGRID, less its border
 VERTEX_GRID_PX = 1 / 256  # rasterisers move the ends of edges to a grid this fine
 LEAST_DIVISOR = 1e-6  # a camera that looks straight up or down has no horizon
 MIN_SUN_HEIGHT = 1e-3  # sine of the least elevation at which shadows are still cast; config asks for 1 deg
@@ -121,7 +122,6 @@ def silhouette(solid: Polyhedra, stand: Stand, camera: CameraPose, projection: P
         far_cut & solid.face_is_real & is_turned_to_us,
     ]
     sides = jnp.concatenate([ends, near_ends, far_ends])
-    sides = jnp.round(sides / VERTEX_GRID_PX) * VERTEX_GRID_PX
     return _sides(*_compact(sides, jnp.concatenate(is_side), max_sides(solid)))
 
 
@@ -145,18 +145,30 @@ def shadow(
 def ground(map_size_m: float, camera: CameraPose, projection: Projection) -> Sides:
     """The sides of the image of the square map.
 
-    Each edge of the map is drawn as two, from its point nearest to the camera: where it passes close by,
-    float32 keeps the image of a near point sharp, and not that of a line between corners 25 m apart.
+    Each edge of the map is drawn in the pieces that MuJoCo draws. That gives the same rounding, and float32 keeps
+    the image of a near piece sharp, and not that of a line between corners 25 m apart.
     """
-    half = map_size_m / 2
-    x, y = jnp.clip(camera.position_m[:2], -half, half)
-    loop = [(half, half), (x, half), (-half, half), (-half, y)]
-    loop += [(-half, -half), (x, -half), (half, -half), (half, y)]
-    loop_m = jnp.array([(*point, 0.0) for point in loop], jnp.float32)
-    edges = np.array([[1, 0], [1, 2], [3, 2], [3, 4], [5, 4], [5, 6], [7, 6], [7, 0]], np.int32)
-    points = rotate(camera_axes(camera), loop_m - camera.position_m)
+    along = _ground_lines_m(map_size_m)[:-1]
+    across = np.full_like(along, along[0])
+    quarter = np.stack([along, across, np.zeros_like(along)], axis=-1)
+    quarter_turn = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    loop_m = np.concatenate([quarter @ np.linalg.matrix_power(quarter_turn, k) for k in range(4)])
+    edges = np.stack([np.arange(len(loop_m)), np.roll(np.arange(len(loop_m)), -1)], axis=-1)
+    points = rotate(camera_axes(camera), jnp.asarray(loop_m, jnp.float32) - camera.position_m)
     is_seen = jnp.broadcast_to(camera.position_m[2] > 0.0, len(edges))
     return _sides(*_flat_polygon(points, edges, is_seen, projection, _far_shift_px(camera, projection)))
+
+
+def _ground_lines_m(map_size_m: float) -> Float64[np.ndarray, "lines"]:
+    """Where MuJoCo's grid lines cross an edge of the ground, from end to end.
+
+    Squares of twice the grid's spacing, an even number each way, and a border of what is left over.
+    """
+    half = map_size_m / 2
+    spacing = max(GROUND_GRID_M, half / MUJOCO_MAX_SQUARES)
+    squares = math.floor(half / spacing) // 2 * 2
+    inner = spacing * np.arange(-squares, squares + 1, 2)
+    return np.unique(np.concatenate([[-half], inner, [half]]))
 
 
 def _far_shift_px(camera: CameraPose, projection: Projection) -> Float32[Array, ""]:
@@ -228,7 +240,9 @@ def _clip(
     near, is_near = _intersect(ends, projection.near_m, projection)
     far, is_far = _intersect(ends, projection.far_m, projection)
     far = far.at[:, 1].add(far_shift_v_px)
-    image = projection.to_image(points_m)[edges]
+    # As rasterisers do: else upright edges of the goal are off by a pixel where they pass close by pixel centres.
+    image = jnp.round(projection.to_image(points_m) / VERTEX_GRID_PX) * VERTEX_GRID_PX
+    image = image[edges]
     image = jnp.where((depth < projection.near_m)[..., None], near[:, None], image)
     image = jnp.where((depth > projection.far_m)[..., None], far[:, None], image)
     is_gone = jnp.all(depth < projection.near_m, axis=1) | jnp.all(depth > projection.far_m, axis=1)

@@ -31,12 +31,8 @@ TapReader = Callable[[int, int], tuple[Array, Array, Array]]
 class TapPlan:
     """What downsampling reads. NumPy arrays, fixed at build time and read-only."""
 
-    rows: Int32[
-        np.ndarray, "tap_rows"
-    ]  # source row of each tap: four for each output row, in order
-    columns: Int32[
-        np.ndarray, "tap_columns"
-    ]  # source column of each tap: four for each output column
+    rows: Int32[np.ndarray, "tap_rows"]  # source row of each tap: four for each output row, in order
+    columns: Int32[np.ndarray, "tap_columns"]  # source column of each tap: four for each output column
     row_weights: Float32[np.ndarray, "H 4"]
     column_weights: Float32[np.ndarray, "W 4"]
     size: tuple[int, int]  # (H, W) of the output
@@ -61,13 +57,9 @@ def tap_plan(height: int, width: int, scale: float) -> TapPlan:
     """
     for name, value in (("height", height), ("width", width)):
         whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
-        require(
-            whole and value >= MIN_SIZE_PX, name, value, f"a whole number, {MIN_SIZE_PX} or more"
-        )
+        require(whole and value >= MIN_SIZE_PX, name, value, f"a whole number, {MIN_SIZE_PX} or more")
     real = isinstance(scale, numbers.Real) and not isinstance(scale, bool)
-    require(
-        real and math.isfinite(scale) and scale >= 1, "scale", scale, "a finite number, 1 or more"
-    )
+    require(real and math.isfinite(scale) and scale >= 1, "scale", scale, "a finite number, 1 or more")
     return _cached_plan(int(height), int(width), float(scale))
 
 
@@ -219,10 +211,7 @@ def _pack_rgb(
     They pass through one 32-bit word a pixel: stacking them would make XLA compute every sum once
     for each channel, and leave the loop scalar.
     """
-    levels = [
-        jnp.clip(jnp.round(channel), 0.0, MAX_LEVEL).astype(jnp.uint32)
-        for channel in (red, green, blue)
-    ]
+    levels = [jnp.clip(jnp.round(channel), 0.0, MAX_LEVEL).astype(jnp.uint32) for channel in (red, green, blue)]
     word = levels[0] | (levels[1] << 8) | (levels[2] << 16)
     return jax.lax.bitcast_convert_type(word, jnp.uint8)[..., :3]
 
@@ -235,8 +224,7 @@ def _require_array(value: object, name: str, shape: tuple, *dtypes: type) -> Non
     if not isinstance(value, (jax.Array, np.ndarray)):
         raise ConfigError(f"{name} is a {type(value).__name__}: should be a NumPy or JAX array")
     fits = len(value.shape) == len(shape) and all(
-        isinstance(wanted, str) or wanted == got
-        for wanted, got in zip(shape, value.shape, strict=True)
+        isinstance(wanted, str) or wanted == got for wanted, got in zip(shape, value.shape, strict=True)
     )
     wanted_shape = "(" + ", ".join(str(size) for size in shape) + ")"
     require(fits, f"{name}.shape", value.shape, wanted_shape)

@@ -93,9 +93,7 @@ def mujoco_frames(scene, poses, monkeypatch):
     data = mujoco.MjData(model)
     names = [model.geom(i).name for i in range(model.ngeom)]
     prefixes = ("space", "ground", "rock", "goal")
-    table = [
-        [n.startswith(p) for p in prefixes].index(True) if "rover" not in n else 9 for n in names
-    ]
+    table = [[n.startswith(p) for p in prefixes].index(True) if "rover" not in n else 9 for n in names]
     options = mujoco.MjvOption()
     options.geomgroup[2] = 0  # the rover's shell
     cameras, frames = [], []
@@ -192,9 +190,7 @@ def test_scenes_of_a_batch_do_not_mix(taps):
     camera = looking_along_x(0)
     batch = jax.tree.map(lambda leaf: leaf.reshape(2, 2, *leaf.shape[1:]), stack(*scenes))
     draw = jax.vmap(jax.vmap(taps.classes, in_axes=(0, None)), in_axes=(0, None))
-    frames = np.asarray(jax.jit(draw)(batch, camera)).reshape(
-        4, *taps.classes(scenes[0], camera).shape
-    )
+    frames = np.asarray(jax.jit(draw)(batch, camera)).reshape(4, *taps.classes(scenes[0], camera).shape)
     for index, scene in enumerate(scenes):
         np.testing.assert_array_equal(frames[index], taps.classes(scene, camera))
         assert all(np.any(frames[index] != frames[other]) for other in range(index))
@@ -310,9 +306,7 @@ gl.Canvas.close = lambda canvas: print("freed", close(canvas))
 
 def run_script(script, **environment):
     command = [sys.executable, "-c", script]
-    return subprocess.run(
-        command, env=os.environ | environment, capture_output=True, text=True, timeout=120
-    )
+    return subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=120)
 
 
 @pytest.mark.gl

@@ -19,6 +19,7 @@ from segvisrl_jax.env.scene import sample_scene
 from segvisrl_jax.types import CameraPose, PhysicsState, Scene
 from segvisrl_jax.vision.classes import SegmentationClass
 from segvisrl_jax.vision.gl import GlRenderer
+from segvisrl_jax.vision.projection import Projection
 from segvisrl_jax.vision.resample import tap_plan
 from segvisrl_jax.vision.scanline import ScanlineRenderer
 
@@ -102,6 +103,8 @@ def hard_frame(config, rng, scene, kind):
         rocks[0], goal[:] = ahead(rng.uniform(0.6, 2), 0.3), ahead(rng.uniform(2, 6), -0.3)
     elif kind == "goal fills view":
         goal[:] = ahead(0.35 + rng.uniform(0.05, 1), rng.uniform(-0.3, 0.3))
+    elif kind == "level":
+        pitch, roll = 0.0, 0.0
     elif kind == "tumbled":
         pitch, roll = rng.uniform(-1, 1, 2)
     _keep_apart(rng, scene, radius, xy)
@@ -151,6 +154,25 @@ def test_classes_are_mujocos():
 def test_classes_are_mujocos_in_many_frames(num_rocks, num_frames):
     wrong = wrong_pixels(num_rocks, num_frames, seed=10_000)
     assert {frame: count for frame, count in wrong.items() if count > MAX_WRONG} == {}
+
+
+@pytest.mark.gl
+def test_edges_on_pixel_centres_are_mujocos():
+    """A level horizon and an upright edge of the goal, a thousandth of a pixel before or behind pixel centres."""
+    config = EnvConfig(scene=SceneConfig(num_rocks=0))
+    reference, draw = GlRenderer(config, *EVERYWHERE), whole_images(config, "classes")
+    projection = Projection.from_config(config.camera)
+    focal, far = projection.focal_px, projection.far_m
+    for off in (-0.001, 0.0, 0.001):
+        scene = dataclasses.replace(sampled(config, 0), goal_yaw_rad=np.float32(0))
+        horizon = camera_at((-10.0, 0.0), height=(17.5 + off) * far / focal)
+        scene.goal_xy_m[:] = (-5.0, 0.0)
+        reach = (200.5 + off) * 5.0 / focal  # the goal's foremost left edge that far from the middle, 5 m ahead
+        upright = camera_at((-10.0, BEACON_RADIUS_M - reach))
+        for camera in (horizon, upright):
+            truth = np.asarray(reference.classes(scene, camera))
+            assert np.count_nonzero(truth != np.asarray(draw(scene, camera))) <= MAX_WRONG
+    reference.close()
 
 
 @pytest.mark.gl
