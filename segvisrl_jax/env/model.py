@@ -39,8 +39,8 @@ SUN_DISTANCE_M = 10.0
 SHADOW_AHEAD_M = 9.0
 """The middle of the square that gets shadows, ahead of the rover; its half side is world.xml's
 shadowclip, 12 m, so that shadows reach from 3 m behind the rover to beyond the far plane."""
-GROUND_GRID_M = 1.0
-"""Spacing of the plane's grid lines, which only MuJoCo's wireframe view draws."""
+GROUND_GRID_M = 0.25
+"""MuJoCo draws a plane in squares of this size; small ones keep OpenGL's rounding of their corners off the horizon."""
 
 
 def build_model(config: EnvConfig) -> mujoco.MjModel:
