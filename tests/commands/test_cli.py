@@ -24,7 +24,7 @@ def segvisrl(*words, cwd):
     ("words", "says"),
     [
         (["fly"], ["'fly'", "train", "eval"]),
-        (["train", "--arch", "resnet"], ["--arch", "resnet", "cnn_lstm_raw"]),
+        (["train", "--arch", "resnet"], ["arch", "resnet", "cnn_lstm_raw"]),
         (["train", "--preset", "huge"], ["preset", "huge", "smoke"]),
         (["train", "--env.camera.scale", "-2"], ["scale", "-2", "1 or more"]),
         (["train", "--env.camera.scale", "600"], ["scale", "600", "at least 4 pixels"]),
