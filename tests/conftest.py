@@ -4,6 +4,7 @@ import os
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 settings.register_profile(
@@ -14,3 +15,34 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("repeatable")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that compare with OpenGL are left out, by name, where it cannot be opened; all else runs anywhere."""
+    marked = [item for item in items if item.get_closest_marker("gl")]
+    reason = _why_no_opengl() if marked else ""
+    for item in marked:
+        if reason:
+            item.add_marker(pytest.mark.skip(reason=reason))
+
+
+def _why_no_opengl() -> str:
+    from segvisrl_jax.config import ConfigError
+    from segvisrl_jax.vision.gl_context import open_gl_context
+
+    try:
+        open_gl_context(16, 16).free()
+    except ConfigError as error:
+        return str(error)
+    return ""
+
+
+@pytest.fixture(autouse=True)
+def _mujoco_without_a_display(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``mujoco.Renderer`` opens OpenGL as the project does; by itself it wants a display, and aborts without one."""
+    if request.node.get_closest_marker("gl"):
+        from mujoco.rendering.classic import gl_context
+
+        from segvisrl_jax.vision.gl_context import open_gl_context
+
+        monkeypatch.setattr(gl_context, "GLContext", open_gl_context)

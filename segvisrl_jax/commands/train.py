@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from segvisrl_jax.cli import INTERRUPTED, parse
-from segvisrl_jax.config import ConfigError, TrainConfig, from_dict, preset_config, to_dict
+from segvisrl_jax.config import ConfigError, TrainConfig, flatten, from_dict, preset_config, to_dict
 
 TEST_EPISODES = 200  # driven after training, on scenes that neither training nor the choice of the policy saw
 
@@ -82,8 +82,8 @@ def _without(words: list[str], option: str) -> list[str]:
 
 def differences_from_paper(config: TrainConfig) -> str:
     """One block: what of these settings is not the paper's."""
-    paper = _flat(to_dict(preset_config(config.arch, "paper")))
-    ours = _flat(to_dict(config))
+    paper = flatten(to_dict(preset_config(config.arch, "paper")))
+    ours = flatten(to_dict(config))
     bookkeeping = ("seed", "run", "runs_dir", "resume", "preset", "checkpoint_every_updates")
     rows = [
         f"  {name:<34} {_short(value):>12}   paper {_short(paper[name])}"
@@ -106,13 +106,6 @@ def observation_memory(config: TrainConfig) -> str:
     if config.ppo.redraw_observations:
         return f"  observations: {total:,.1f} MB a batch, drawn again when needed (not stored)"
     return f"  observations: {total:,.1f} MB a batch, stored"
-
-
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in tree.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
-    return flat
 
 
 def _short(value: Any) -> str:

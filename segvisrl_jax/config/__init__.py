@@ -9,7 +9,7 @@ from segvisrl_jax.config.environment import CameraConfig, EnvConfig, PhysicsConf
 from segvisrl_jax.config.learning import EvaluationConfig, NetworkConfig, PPOConfig, TrainConfig
 from segvisrl_jax.config.names import ARCH_OBSERVATION, Arch, EngineName, ObservationKind, PresetName, RendererName
 from segvisrl_jax.config.presets import preset_config
-from segvisrl_jax.config.tree import from_dict, replace_fields, to_dict
+from segvisrl_jax.config.tree import flatten, from_dict, replace_fields, to_dict
 
 __all__ = [
     "ARCH_OBSERVATION",
@@ -28,6 +28,7 @@ __all__ = [
     "SceneConfig",
     "TaskConfig",
     "TrainConfig",
+    "flatten",
     "from_dict",
     "preset_config",
     "replace_fields",

@@ -74,3 +74,11 @@ def from_dict(kind: type[ConfigT], data: Any, where: str = "config") -> ConfigT:
         value = tuple(value) if isinstance(value, list) else value
         values[name] = from_dict(part, value, f"{where}.{name}") if is_part else value  # type: ignore[arg-type]
     return kind(**values)
+
+
+def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as one dict with dotted names."""
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return flat

@@ -14,7 +14,7 @@ from flax import struct
 
 from segvisrl_jax.agent.networks import Network, make_network
 from segvisrl_jax.agent.ppo import Learner, LearnerState, make_learner
-from segvisrl_jax.config import ConfigError, EnvConfig, TrainConfig, replace_fields, to_dict
+from segvisrl_jax.config import ConfigError, EnvConfig, TrainConfig, flatten, replace_fields, to_dict
 from segvisrl_jax.env.rover_env import RoverEnv
 from segvisrl_jax.env.wrappers import VALIDATION_STREAM, BatchEnv, scene_stream
 from segvisrl_jax.training.checkpoint import Checkpoints, save_policy
@@ -25,6 +25,7 @@ from segvisrl_jax.training.rollout import ActorState, EpisodeLog, start_acting, 
 from segvisrl_jax.types import Outcome
 
 RECENT_EPISODES = 200  # what the progress bar's shares are taken over
+FREE_ON_RESUME = ("steps", "resume", "runs_dir", "run", "evaluation", "checkpoint_every_updates", "preset")
 OUTCOMES = (Outcome.SUCCESS, Outcome.COLLISION, Outcome.FALL, Outcome.TIMEOUT)
 
 
@@ -217,15 +218,10 @@ def open_run_dir(config: TrainConfig) -> Path:
 
 def _require_same_run(config: TrainConfig, before: dict[str, Any], run_dir: Path) -> None:
     """Only the number of steps and bookkeeping may change when a run goes on."""
-    free = ("steps", "resume", "runs_dir", "run", "evaluation", "checkpoint_every_updates", "preset")
-    for name, value in to_dict(config).items():
-        if name not in free and before.get(name) != json.loads(json.dumps(value)):
-            was, now = before.get(name), value
-            if isinstance(value, dict):
-                changed = [key for key in value if (was or {}).get(key) != value[key]]
-                name = f"{name}.{changed[0]}" if changed else name
-                was, now = (was or {}).get(changed[0]), value.get(changed[0])
-            raise ConfigError(f"{name} = {now!r}: should be {was!r}, as when {run_dir} was started")
+    now, then = flatten(json.loads(json.dumps(to_dict(config)))), flatten(before)
+    for name, value in now.items():
+        if name.split(".")[0] not in FREE_ON_RESUME and value != then.get(name):
+            raise ConfigError(f"{name} = {value!r}: should be {then.get(name)!r}, as when {run_dir} was started")
 
 
 class StopSignals:
