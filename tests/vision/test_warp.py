@@ -30,6 +30,7 @@ CONFIG = EnvConfig(
 )
 EVERYWHERE = (np.arange(HEIGHT), np.arange(WIDTH))
 MAX_WRONG_SHARE = 1e-5  # 99.999 % of all pixels agree
+ROUNDING_SHARE = 5e-5  # scanline rounds corners as OpenGL does, to 1/256 of a pixel; rays are not rounded
 SPACE, GROUND, ROCK, GOAL = SegmentationClass
 HALF_MAP_M = 12.5
 needs_warp = pytest.mark.skipif(find_spec("warp") is None, reason="warp-lang is not installed")
@@ -140,7 +141,7 @@ def test_classes_are_those_of_the_scanline_renderer(renderer):
     drawers = (renderer, ScanlineRenderer(CONFIG, *EVERYWHERE))
     images = [np.asarray(jax.jit(jax.vmap(drawer.classes))(scenes, cameras)) for drawer in drawers]
     assert set(np.unique(images[0])) == {SPACE, GROUND, ROCK, GOAL}
-    assert np.count_nonzero(images[0] != images[1]) <= MAX_WRONG_SHARE * images[0].size
+    assert np.count_nonzero(images[0] != images[1]) <= ROUNDING_SHARE * images[0].size
 
 
 def test_what_is_beyond_the_far_plane_or_the_map_is_space(renderer):
