@@ -34,6 +34,8 @@ WHEEL_NAMES = ("front_left", "front_right", "rear_left", "rear_right")
 """Order of the wheel joints in qpos and qvel, and of the actuators."""
 PARKED_Z_M = -1000.0
 """Height of a rock that the scene does not use: under the ground and beyond any far plane."""
+CONTACT_TIME_S = 0.04
+"""Time constant of the wheels' contact: on the Moon they then sink in by less than a millimetre."""
 SUN_DISTANCE_M = 10.0
 """From the ground to the light's place; it matters for shadows only, the light is directional."""
 SHADOW_AHEAD_M = 9.0
@@ -127,6 +129,7 @@ def _apply_physics(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
     spec.option.gravity = (0.0, 0.0, -physics.gravity_m_s2)
     for pair in spec.pairs:
         pair.friction[:2] = physics.wheel_friction  # both sliding directions
+        pair.solref[0] = max(CONTACT_TIME_S, 2 * physics.timestep_s)  # MuJoCo carries no shorter one
 
 
 def _apply_camera(spec: mujoco.MjSpec, camera: CameraConfig) -> None:
