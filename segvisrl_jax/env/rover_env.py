@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from brax.envs.base import Env, State
-from jaxtyping import Array, Float32, Int32, PRNGKeyArray
+from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt8
 
 from segvisrl_jax.config import EngineName, EnvConfig, ObservationKind, RendererName, replace_fields
 from segvisrl_jax.env import model, rocks, task
@@ -63,7 +63,9 @@ class RoverEnv(Env):
         self._plan = tap_plan(camera.height_px, camera.width_px, camera.scale)
         self.renderer = None
         if config.obs != "state":
-            self.renderer = make_renderer(config, self._plan.rows, self._plan.columns)
+            rows, self._row_taps = np.unique(self._plan.rows, return_inverse=True)
+            columns, self._column_taps = np.unique(self._plan.columns, return_inverse=True)
+            self.renderer = make_renderer(config, rows, columns)
 
     # brax's contract
 
@@ -164,9 +166,15 @@ class RoverEnv(Env):
             return self._state_vector(state)
         camera = camera_pose(state.physics, self._mount)
         if self.config.obs == "rgb":
-            return resample_taps(self.renderer.rgb(state.scene, camera), self._plan)
-        classes = self.renderer.classes(state.scene, camera)
+            return resample_taps(self._taps(self.renderer.rgb(state.scene, camera)), self._plan)
+        classes = self._taps(self.renderer.classes(state.scene, camera))
         return colour_and_resample(classes, self._plan, PALETTE)
+
+    def _taps(self, drawn: UInt8[Array, "rows columns ..."]) -> UInt8[Array, "taps_h taps_w ..."]:
+        """Rows and columns that downsampling reads more than once (at the border, and everywhere below scale 4)."""
+        if drawn.shape[:2] == self._plan.tap_size:
+            return drawn
+        return drawn[self._row_taps][:, self._column_taps]
 
     def _state_vector(self, state: RoverState) -> Float32[Array, "7"]:
         qpos, qvel = state.physics.qpos, state.physics.qvel

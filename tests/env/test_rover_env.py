@@ -2,6 +2,7 @@
 
 import functools
 
+import cv2
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -11,8 +12,11 @@ from brax.envs.base import Env, State
 
 import segvisrl_jax
 from segvisrl_jax.config import ConfigError
+from segvisrl_jax.env.pose import camera_mount, camera_pose
 from segvisrl_jax.env.wrappers import BatchEnv
 from segvisrl_jax.types import Outcome
+from segvisrl_jax.vision.classes import PALETTE
+from segvisrl_jax.vision.gl import GlRenderer
 
 SMALL = {"scale": 120}
 
@@ -178,3 +182,20 @@ def test_same_key_same_episode():
 def test_a_wrong_setting_is_refused_with_its_name_and_what_would_be_right(fields, says):
     with pytest.raises(ConfigError, match=says):
         segvisrl_jax.make_env(**fields)
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("scale", [1, 2, 3, 7, 60])
+def test_every_scale_sees_what_opencv_makes_of_the_whole_image(scale):
+    """Small scales read pixels more than once, odd ones leave a remainder."""
+    size = {"width_px": 320, "height_px": 270}
+    env = segvisrl_jax.make_env(physics="native", scale=scale, **size)
+    rover = jax.jit(env.initial_state)(jax.random.key(10))
+    whole = GlRenderer(env.config, np.arange(270), np.arange(320))
+    image = PALETTE[np.asarray(whole.classes(rover.scene, camera_pose(rover.physics, camera_mount(env.mj_model))))]
+    whole.close()
+    rows, columns, _ = env.observation_shape
+    expected = cv2.resize(image, (columns, rows), interpolation=cv2.INTER_CUBIC).astype(int)
+    seen = np.asarray(jax.jit(env.observe)(rover)).astype(int)
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) >= 3
+    assert np.mean(np.abs(seen - expected) > 1) < 1e-3
