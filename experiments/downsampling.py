@@ -79,11 +79,14 @@ for axes, kind, name in zip(figure.subplots(1, 2, sharey=True), (0, 1), names, s
     axes.set_xticks(range(len(DISTANCES_M)), [f"{d:g}" for d in DISTANCES_M])
     axes.set_yticks(range(len(SCALES)), [f"{s} ({round(1920 / s)} x {round(1080 / s)})" for s in SCALES])
     axes.set_xlabel("distance [m]")
-    axes.set_title(f"{name}: pixels left, and share of places where it is seen")
+    axes.set_title(name)
     for (i, j), number in np.ndenumerate(pixels[:, :, kind]):
         label = f"{number:.0f}" if number >= 10 else f"{number:.1f}"
-        axes.text(j, i, label, ha="center", va="center", color="white", fontsize=7)
+        axes.text(
+            j, i, label, ha="center", va="center", color="black" if shares[i, j, kind] > 0.5 else "white", fontsize=7
+        )
 figure.axes[0].set_ylabel("scale (image)")
+figure.suptitle("Pixels left of an object (numbers), and in how many of 24 places it is still seen (colour)")
 figure.colorbar(mesh, ax=figure.axes, label="seen [% of places]")
 figure.savefig(OUTPUT / "downsampling.png", dpi=110)
 print(OUTPUT / "downsampling.png")
