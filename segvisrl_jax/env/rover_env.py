@@ -17,6 +17,7 @@ from segvisrl_jax.env.pose import camera_mount, camera_pose, in_rover_frame, up_
 from segvisrl_jax.env.scene import sample_scene
 from segvisrl_jax.types import (
     Action,
+    CameraPose,
     Observation,
     Outcome,
     PhysicsState,
@@ -25,8 +26,9 @@ from segvisrl_jax.types import (
     Scene,
     StepResult,
 )
+from segvisrl_jax.vision.batching import one_by_one_on_cpu
 from segvisrl_jax.vision.classes import PALETTE
-from segvisrl_jax.vision.renderer import make_renderer
+from segvisrl_jax.vision.renderer import InGraphRenderer, make_renderer
 from segvisrl_jax.vision.resample import colour_and_resample, resample_taps, tap_plan
 
 TYPICAL_TURN_RATE_RAD_S = 0.5  # scales the turn rate in the state observation to about 1
@@ -66,6 +68,8 @@ class RoverEnv(Env):
             rows, self._row_taps = np.unique(self._plan.rows, return_inverse=True)
             columns, self._column_taps = np.unique(self._plan.columns, return_inverse=True)
             self.renderer = make_renderer(config, rows, columns)
+            look = self._look_at_colours if config.obs == "rgb" else self._look_at_classes
+            self._look = one_by_one_on_cpu(look) if isinstance(self.renderer, InGraphRenderer) else look
 
     # brax's contract
 
@@ -164,11 +168,16 @@ class RoverEnv(Env):
         """What the agent sees now. Unbatched."""
         if self.renderer is None:
             return self._state_vector(state)
-        camera = camera_pose(state.physics, self._mount)
-        if self.config.obs == "rgb":
-            return resample_taps(self._taps(self.renderer.rgb(state.scene, camera)), self._plan)
-        classes = self._taps(self.renderer.classes(state.scene, camera))
-        return colour_and_resample(classes, self._plan, PALETTE)
+        return self._look(state.scene, camera_pose(state.physics, self._mount))
+
+    def _look_at_classes(self, scene: Scene, camera: CameraPose) -> UInt8[Array, "H W 3"]:
+        if isinstance(self.renderer, InGraphRenderer):
+            classes, is_plain = self.renderer.classes_and_plain_rows(scene, camera)
+            return colour_and_resample(self._taps(classes), self._plan, PALETTE, is_plain[self._row_taps])
+        return colour_and_resample(self._taps(self.renderer.classes(scene, camera)), self._plan, PALETTE)
+
+    def _look_at_colours(self, scene: Scene, camera: CameraPose) -> UInt8[Array, "H W 3"]:
+        return resample_taps(self._taps(self.renderer.rgb(scene, camera)), self._plan)
 
     def _taps(self, drawn: UInt8[Array, "rows columns ..."]) -> UInt8[Array, "taps_h taps_w ..."]:
         """Rows and columns that downsampling reads more than once (at the border, and everywhere below scale 4)."""
@@ -218,7 +227,7 @@ def make_env(
     Args:
         obs: ``segmentation``, ``rgb`` or ``state``.
         scale: bicubic downsampling per axis.
-        renderer: ``auto``, ``scanline`` or ``gl``.
+        renderer: ``auto`` (``scanline``), ``scanline``, ``gl`` or ``warp``.
         physics: ``auto``, ``native`` or ``mjx``.
         num_rocks: rocks on the map.
         **fields: any other field of ``EnvConfig`` or of its parts, by its name, e.g. ``goal_distance_max_m=20``.

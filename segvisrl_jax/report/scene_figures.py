@@ -1,6 +1,6 @@
 """Figures of a scene and of the pipeline as PNG files: driven paths, what the network sees."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ OUTCOME_MARKERS = {
     Outcome.TIMEOUT: "s",
     Outcome.UNSTABLE: "P",
 }
+PANELS_IN_ROW = 3
 
 
 def trajectories(scene: SceneMap, paths: Sequence[DrivenPath], path_png: Path, title: str = "") -> Path:
@@ -86,29 +87,30 @@ def _draw_scene(axes: Axes, scene: SceneMap) -> None:
 def preprocessing(
     raw_rgb: UInt8[np.ndarray, "H W 3"],
     class_ids: UInt8[np.ndarray, "H W"],
-    observation: UInt8[np.ndarray, "h w 3"],
+    observations: Mapping[str, UInt8[np.ndarray, "_ _ 3"]],
     path_png: Path,
 ) -> Path:
-    """Draws the steps from the camera's image to what the network sees, in one row.
+    """Draws the steps from the camera's image to what the network sees, three in a row (paper, figure 3).
 
     Args:
         raw_rgb: what the camera sees.
         class_ids: the class of every pixel (``vision.classes``).
-        observation: coloured and shrunk.
+        observations: coloured and shrunk, more and more; by what stands over it, to which its size is added.
         path_png: the figure.
     """
-    panels = (
-        ("Camera", raw_rgb),
-        ("Segmented", PALETTE[class_ids]),
-        ("Observation", observation),
-    )
-    figure = Figure(figsize=(13, 3.1), layout="constrained")
-    for axes, (name, image) in zip(figure.subplots(1, 3), panels, strict=True):
-        rows, columns = image.shape[:2]
-        is_small = columns < figure.get_figwidth() * DOTS_PER_INCH / len(panels)
-        axes.imshow(image, interpolation="nearest" if is_small else "antialiased")
-        axes.set_title(f"{name}, {columns} x {rows}", fontsize=12)
+    panels = {"Camera": raw_rgb, "Segmented": PALETTE[class_ids], **observations}
+    rows = -(-len(panels) // PANELS_IN_ROW)
+    figure = Figure(figsize=(13, 0.4 + 2.7 * rows), layout="constrained")
+    grid = figure.subplots(rows, PANELS_IN_ROW, squeeze=False).ravel()
+    for axes, (name, image) in zip(grid, panels.items(), strict=False):
+        height, width = image.shape[:2]
+        is_small = width < figure.get_figwidth() * DOTS_PER_INCH / PANELS_IN_ROW
+        axes.imshow(image, interpolation="nearest" if is_small else "antialiased", aspect="auto")
+        axes.set_box_aspect(raw_rgb.shape[0] / raw_rgb.shape[1])
+        axes.set_title(f"{name}, {width} x {height}", fontsize=12)
         axes.set(xticks=[], yticks=[])
+    for axes in grid[len(panels) :]:
+        axes.remove()
     kinds = [Patch(fc=colour / 255, ec="0.4", label=name) for name, colour in zip(CLASS_NAMES, PALETTE, strict=True)]
     figure.legend(handles=kinds, loc="outside lower center", ncols=len(kinds), frameon=False)
     return save_figure(figure, path_png)

@@ -39,6 +39,13 @@ class Polyhedra:
         fields: dict[str, Any] = {name: np.stack([part[name] for part in parts]) for name in parts[0]}
         return cls(**fields)
 
+    def bounding_balls(self) -> tuple[Float32[np.ndarray, "N"], Float32[np.ndarray, "N"]]:
+        """(height of the middle above the origin, radius) of a ball around each solid."""
+        height = np.max(self.vertices_m[..., 2], axis=1) / 2
+        middle = np.stack([np.zeros_like(height), np.zeros_like(height), height], axis=-1)
+        radius = np.max(np.linalg.norm(self.vertices_m - middle[:, None], axis=-1), axis=1)
+        return height.astype(np.float32), radius.astype(np.float32)
+
     def take(self, index: Int32[Array, "*K"]) -> "Polyhedra":
         """The polyhedra with these numbers."""
         return jax.tree.map(lambda array: jnp.asarray(array)[index], self)

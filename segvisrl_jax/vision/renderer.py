@@ -1,10 +1,10 @@
 """What a renderer must do: answer for the pixels of the source image that downsampling reads."""
 
 from importlib.util import find_spec
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Array, Int, UInt8
+from jaxtyping import Array, Bool, Int, UInt8
 
 from segvisrl_jax.config import EnvConfig, require
 from segvisrl_jax.types import CameraPose, Scene
@@ -25,6 +25,17 @@ class Renderer(Protocol):
 
     def rgb(self, scene: Scene, camera: CameraPose) -> UInt8[Array, "rows columns 3"]:
         """Colour at every wanted row and column."""
+        ...
+
+
+@runtime_checkable
+class InGraphRenderer(Renderer, Protocol):
+    """A renderer of pure JAX: on a CPU, an image is best drawn and shrunk before the next is begun."""
+
+    def classes_and_plain_rows(
+        self, scene: Scene, camera: CameraPose
+    ) -> tuple[UInt8[Array, "rows columns"], Bool[Array, "rows"]]:
+        """``classes``, and True where a row shows one class only, so that shrinking may leave it out."""
         ...
 
 

@@ -15,7 +15,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float32, Int32, Shaped, UInt8
+from jaxtyping import Array, Bool, Float32, Int32, Shaped, UInt8, UInt32
 
 from segvisrl_jax.config import ConfigError, require
 
@@ -23,6 +23,7 @@ NUM_TAPS = 4  # source pixels per axis under the cubic kernel
 CUBIC_A = -0.75  # the kernel's free parameter, as in OpenCV (jax.image and Pillow take -0.5)
 MIN_SIZE_PX = 4  # a smaller image is narrower than the kernel
 MAX_LEVEL = 255.0  # the brightest uint8
+BAND_ROWS = 4  # output rows that a CPU works out together; nine in ten bands of a driving view show one class
 
 TapReader = Callable[[int, int], tuple[Array, Array, Array]]
 
@@ -136,13 +137,14 @@ def resample_taps(taps: Shaped[Array | np.ndarray, "..."], plan: TapPlan) -> UIn
         tap = blocks[:, row, :, column].astype(jnp.float32)
         return tap[..., 0], tap[..., 1], tap[..., 2]
 
-    return _pack_rgb(*_weighted_sum(read, plan))
+    return _bytes(_words(*_weighted_sum(read, jnp.asarray(plan.row_weights), plan)))
 
 
 def colour_and_resample(
     classes: Shaped[Array | np.ndarray, "..."],
     plan: TapPlan,
     palette: Shaped[Array | np.ndarray, "..."],
+    plain_rows: Shaped[Array, "..."] | None = None,
 ) -> UInt8[Array, "H W 3"]:
     """What ``resample_taps(palette[classes], plan)`` gives, without ever colouring the taps.
 
@@ -154,12 +156,58 @@ def colour_and_resample(
         classes: (4 H, 4 W) uint8 class ids, 0 to 3, at ``plan.rows`` x ``plan.columns``.
         plan: from ``tap_plan``.
         palette: (4, 3) uint8, the colour of each class.
+        plain_rows: (4 H,) bool, True where a row shows one class only. A CPU then leaves out what is plain.
 
     Raises:
         ConfigError: for arguments of another shape or type.
     """
     _require_array(classes, "classes", plan.tap_size, np.uint8)
     _require_array(palette, "palette", (4, 3), np.uint8)
+    palette = np.asarray(palette)
+    row_weights = jnp.asarray(plan.row_weights)
+    if plain_rows is None:
+        return _bytes(_shrink_rows(jnp.asarray(classes), row_weights, plan, palette))
+    _require_array(plain_rows, "plain_rows", plan.tap_size[:1], np.bool_)
+    words = jax.lax.platform_dependent(
+        jnp.asarray(classes),
+        plain_rows,
+        cpu=functools.partial(_shrink_mixed_bands, plan=plan, palette=palette),
+        default=lambda classes, _: _shrink_rows(classes, row_weights, plan, palette),
+    )
+    return _bytes(words)
+
+
+def _shrink_mixed_bands(
+    classes: UInt8[Array, "tap_rows tap_columns"],
+    plain_rows: Bool[Array, "tap_rows"],
+    plan: TapPlan,
+    palette: UInt8[np.ndarray, "4 3"],
+) -> UInt32[Array, "H W"]:
+    """Fills bands of rows that show one class, and works out the others."""
+    height, width = plan.size
+    rows = max(n for n in range(1, BAND_ROWS + 1) if height % n == 0)
+    tap_rows = rows * NUM_TAPS
+    first = classes[:, 0].reshape(-1, tap_rows)
+    is_plain = jnp.all(plain_rows.reshape(-1, tap_rows) & (first == first[:, :1]), axis=1)
+    plain = jnp.repeat(_words(*jnp.asarray(palette, jnp.float32)[first[:, 0]].T), rows)
+    mixed_first = jnp.argsort(is_plain)
+
+    def add_band(place: Array, image: Array) -> Array:
+        band = mixed_first[place]
+        taps = jax.lax.dynamic_slice_in_dim(classes, band * tap_rows, tap_rows)
+        weights = jax.lax.dynamic_slice_in_dim(jnp.asarray(plan.row_weights), band * rows, rows)
+        return jax.lax.dynamic_update_slice_in_dim(image, _shrink_rows(taps, weights, plan, palette), band * rows, 0)
+
+    image = jnp.broadcast_to(plain[:, None], (height, width))
+    return jax.lax.fori_loop(0, jnp.sum(~is_plain), add_band, image)
+
+
+def _shrink_rows(
+    classes: UInt8[Array, "4*R tap_columns"],
+    row_weights: Float32[Array, "R 4"],
+    plan: TapPlan,
+    palette: UInt8[np.ndarray, "4 3"],
+) -> UInt32[Array, "R W"]:
     blocks = _blocks(classes, plan)
 
     def read(row: int, column: int) -> tuple[Array, Array, Array]:
@@ -167,53 +215,52 @@ def colour_and_resample(
         low, high = tap & 1, tap >> 1
         return low.astype(jnp.float32), high.astype(jnp.float32), (low & high).astype(jnp.float32)
 
-    low, high, both = _weighted_sum(read, plan)
-    table = jnp.asarray(palette, jnp.float32)
+    low, high, both = _weighted_sum(read, row_weights, plan)
     channels = []
-    for first, second, third, fourth in table.T:
+    for first, second, third, fourth in palette.astype(np.float32).T:
         mixed = low * (second - first) + high * (third - first)
         channels.append(first + mixed + both * (fourth - third - second + first))
-    return _pack_rgb(*channels)
+    return _words(*channels)
 
 
 def _blocks(taps: Array | np.ndarray, plan: TapPlan) -> Array:
-    """(4 H, 4 W, ...) taps as (H, 4, W, 4, ...)."""
-    height, width = plan.size
-    shape = (height, NUM_TAPS, width, NUM_TAPS, *taps.shape[2:])
+    """(4 R, 4 W, ...) taps of some or all rows as (R, 4, W, 4, ...)."""
+    shape = (-1, NUM_TAPS, plan.size[1], NUM_TAPS, *taps.shape[2:])
     return jnp.asarray(taps).reshape(shape)
 
 
 def _weighted_sum(
-    read: TapReader, plan: TapPlan
-) -> tuple[Float32[Array, "H W"], Float32[Array, "H W"], Float32[Array, "H W"]]:
+    read: TapReader, row_weights: Float32[Array, "R 4"], plan: TapPlan
+) -> tuple[Float32[Array, "R W"], Float32[Array, "R W"], Float32[Array, "R W"]]:
     """Three planes, each summed over the 4 x 4 taps; ``read`` gives one tap of every output pixel.
 
     Written out tap by tap, since XLA fuses that into one vectorised loop over output pixels: 25 to
     80 times as fast on a CPU as broadcasting the weights over a reshaped array and summing.
     """
-    total = [jnp.zeros(plan.size, jnp.float32)] * 3
+    zero = jnp.zeros((row_weights.shape[0], plan.size[1]), jnp.float32)
+    total = [zero] * 3
     for row in range(NUM_TAPS):
-        along_columns = [jnp.zeros(plan.size, jnp.float32)] * 3
+        along_columns = [zero] * 3
         for column in range(NUM_TAPS):
             weight = plan.column_weights[None, :, column]
             planes = read(row, column)
             along_columns = [s + p * weight for s, p in zip(along_columns, planes, strict=True)]
-        weight = plan.row_weights[:, None, row]
+        weight = row_weights[:, None, row]
         total = [t + s * weight for t, s in zip(total, along_columns, strict=True)]
     return total[0], total[1], total[2]
 
 
-def _pack_rgb(
-    red: Float32[Array, "H W"], green: Float32[Array, "H W"], blue: Float32[Array, "H W"]
-) -> UInt8[Array, "H W 3"]:
-    """Three channels, rounded half to even and saturated.
+def _words(red: Float32[Array, "*P"], green: Float32[Array, "*P"], blue: Float32[Array, "*P"]) -> UInt32[Array, "*P"]:
+    """Three channels, rounded half to even and saturated, in one 32-bit word a pixel, red lowest.
 
-    They pass through one 32-bit word a pixel: stacking them would make XLA compute every sum once
-    for each channel, and leave the loop scalar.
+    Stacking them would make XLA compute every sum once for each channel, and leave the loop scalar.
     """
     levels = [jnp.clip(jnp.round(channel), 0.0, MAX_LEVEL).astype(jnp.uint32) for channel in (red, green, blue)]
-    word = levels[0] | (levels[1] << 8) | (levels[2] << 16)
-    return jax.lax.bitcast_convert_type(word, jnp.uint8)[..., :3]
+    return levels[0] | (levels[1] << 8) | (levels[2] << 16)
+
+
+def _bytes(words: UInt32[Array, "H W"]) -> UInt8[Array, "H W 3"]:
+    return jax.lax.bitcast_convert_type(words, jnp.uint8)[..., :3]
 
 
 def _require_array(value: object, name: str, shape: tuple, *dtypes: type) -> None:

@@ -11,37 +11,61 @@ is never hidden by the other: the line of equal power runs between the circles, 
 on the first one's side of it.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float32, Int, Int32, UInt8
+from flax import struct
+from jaxtyping import Array, Bool, Int, Int32, UInt8
 
 from segvisrl_jax.config import EnvConfig, require
 from segvisrl_jax.env.rocks import concatenate_solids, goal_beacon, rock_library
 from segvisrl_jax.types import CameraPose, Scene
+from segvisrl_jax.vision.batching import one_by_one_on_cpu
 from segvisrl_jax.vision.classes import SegmentationClass
 from segvisrl_jax.vision.painting import (
     Columns,
-    Ground,
     Lines,
-    Solids,
-    one_by_one_on_cpu,
-    paint_ground,
-    paint_solids,
+    Paint,
+    Picture,
+    Window,
+    paint_in_windows,
 )
 from segvisrl_jax.vision.polyhedra import Polyhedra
 from segvisrl_jax.vision.projection import (
+    Box,
     Projection,
     Sides,
     Stand,
-    ground,
+    camera_axes,
+    ground_span,
+    rotate,
     shadow,
     silhouette,
     spans,
 )
-from segvisrl_jax.vision.shading import Surfaces, faces, ground_light
+from segvisrl_jax.vision.shading import Faces, Surfaces, face_light, faces, ground_light
 
 SPACE, GROUND, ROCK, GOAL = (np.uint8(kind) for kind in SegmentationClass)
+
+# Rows and columns that a CPU paints at a time.
+CLASS_WINDOW = (32, 128)
+COLOUR_WINDOW = (32, 64)  # 8 KiB of float32, a part of its first cache
+GROUND_WINDOW = (16, 2048)  # the ground fills its rows: whole rows, or nearly
+
+
+ClassRows = tuple[UInt8[Array, "rows columns"], Bool[Array, "rows"]]
+
+
+@struct.dataclass
+class Solid:
+    """A solid of the scene where it stands, or several."""
+
+    shape: Polyhedra
+    stand: Stand
+    kind: UInt8[Array, "*N"]  # class
 
 
 class ScanlineRenderer:
@@ -80,99 +104,181 @@ class ScanlineRenderer:
         solids = concatenate_solids(rock_library(config.scene), goal_beacon())
         self._polyhedra = Polyhedra.from_solids(solids)
         self._radius_m = solids.radius_m
+        self._ball_height_m, self._ball_radius_m = self._polyhedra.bounding_balls()
         self._goal_shape = len(solids.radius_m) - 1
         self._surfaces = Surfaces.from_world()
-        self._batched_classes = one_by_one_on_cpu(self._draw_classes)
+        self._batched_classes = one_by_one_on_cpu(lambda *args: self._draw_classes(*args)[0])
         self._batched_rgb = one_by_one_on_cpu(self._draw_rgb)
 
     def classes(self, scene: Scene, camera: CameraPose) -> UInt8[Array, "rows columns"]:
         """Class ids (``vision.classes``) at every wanted row and column."""
         return self._batched_classes(scene, camera)
 
+    def classes_and_plain_rows(
+        self, scene: Scene, camera: CameraPose
+    ) -> tuple[UInt8[Array, "rows columns"], Bool[Array, "rows"]]:
+        """``classes``, and where a row shows one class only (not all such rows are found). Not for vmap on a CPU."""
+        return self._draw_classes(scene, camera)
+
     def rgb(self, scene: Scene, camera: CameraPose) -> UInt8[Array, "rows columns 3"]:
         """Colour at every wanted row and column: sun, shadows, black sky."""
         return self._batched_rgb(scene, camera)
 
-    def _draw_classes(self, scene: Scene, camera: CameraPose) -> UInt8[Array, "rows columns"]:
-        polyhedra, stand, _ = self._placed(scene, camera)
-        power = self._power(scene, camera)
-        spans = (self._ground(camera), self._outlines(polyhedra, stand, camera))
-        # Without the barrier, XLA works out every span anew for every pixel in it.
-        layers = jax.lax.optimization_barrier((*spans, power[:-1] > power[-1]))
-        ground_span, solid_spans, is_behind_goal = layers
-        columns = self._lines().columns
-        image = jnp.where(ground_span.cover(columns), GROUND, SPACE)
-        *rocks, goal = (span.cover(columns) for span in _each(solid_spans))
-        image = jnp.where(goal, GOAL, image)
-        for rock, is_behind in zip(rocks, is_behind_goal, strict=True):
-            image = jnp.where(rock & ~(goal & is_behind), ROCK, image)
-        return image
+    # Two ways to the same image: a CPU paints what is seen, solid by solid; an accelerator all solids at once.
+
+    def _draw_classes(self, scene: Scene, camera: CameraPose) -> ClassRows:
+        return jax.lax.platform_dependent(scene, camera, cpu=self._paint_seen_classes, default=self._paint_all_classes)
 
     def _draw_rgb(self, scene: Scene, camera: CameraPose) -> UInt8[Array, "rows columns 3"]:
-        layers = (self._ground(camera), *self._shaded_layers(scene, camera))
-        span, shadows, solids = jax.lax.optimization_barrier(layers)
+        paint = jax.lax.platform_dependent(scene, camera, cpu=self._paint_seen, default=self._paint_all)
+        return self._surfaces.paint(paint.light, paint.kind)
 
-        def sun_and_surface(u_px: Array, v_px: Array) -> tuple[Array, Array]:
-            return ground_light(u_px, v_px, camera, scene.sun_direction, self._projection)
+    def _paint_seen_classes(self, scene: Scene, camera: CameraPose) -> ClassRows:
+        ground = self._ground(camera)
+        image = jnp.where(ground.cover(self._lines.columns), GROUND, SPACE)
+        is_plain = (ground.count == 0) | (ground.count == self._projection.width_px)
 
-        lines = self._lines()
-        picture = paint_ground(Ground(span, shadows, sun_and_surface), lines, self._surfaces)
-        picture = paint_solids(picture, solids, lines, self._surfaces)
-        return self._surfaces.paint(picture.light, picture.kind)
+        def add(solid: Solid, drawn: ClassRows) -> ClassRows:
+            def paint(part: Array, window: Window) -> Array:
+                return jnp.where(window.cover(span), solid.kind, part)
 
-    def _shaded_layers(self, scene: Scene, camera: CameraPose) -> tuple[Columns, Solids]:
-        """The shadows' spans, and the solids from far to near."""
-        polyhedra, stand, shape = self._placed(scene, camera)
-        sun = scene.sun_direction
-        shadows = jax.vmap(lambda solid, place: shadow(solid, place, sun, camera, self._projection))
-        shaded = jax.vmap(lambda solid, place: faces(solid, place, sun, camera, self._projection))
-        solids = Solids(
-            span=self._outlines(polyhedra, stand, camera),
-            faces=shaded(polyhedra, stand),
-            kind=jnp.where(shape == self._goal_shape, GOAL, ROCK),
-        )
-        far_to_near = jnp.argsort(-self._power(scene, camera))
-        solids = jax.tree.map(lambda array: array[far_to_near], solids)
-        return self._columns_in(shadows(polyhedra, stand)), solids
+            image, is_plain = drawn
+            sides = self._sides(solid, camera)
+            box, span = sides.box(), self._columns_in(sides)
+            v_px = self._lines.v_px
+            is_touched = (v_px > box.top_px) & (v_px <= box.bottom_px)
+            return paint_in_windows(image, box, paint, self._lines, CLASS_WINDOW), is_plain & ~is_touched
 
-    def _placed(self, scene: Scene, camera: CameraPose) -> tuple[Polyhedra, Stand, Int32[Array, "solids"]]:
-        """(shape, place, number in the library) of every rock and, last, of the goal."""
-        xy, shape = self._xy_and_shape(scene)
-        yaw = jnp.append(scene.rock_yaw_rad, scene.goal_yaw_rad)
-        stand = jax.vmap(Stand.of, in_axes=(0, 0, None))(xy, yaw, camera)
-        return self._polyhedra.take(shape), stand, shape
+        return self._add_seen(scene, camera, (image, is_plain), add)
 
-    def _xy_and_shape(self, scene: Scene) -> tuple[Array, Array]:
-        xy = jnp.concatenate([scene.rock_xy_m, scene.goal_xy_m[None]])
-        return xy, jnp.append(scene.rock_shape, self._goal_shape)
+    def _paint_all_classes(self, scene: Scene, camera: CameraPose) -> ClassRows:
+        solids = self._solids(scene, camera, self._far_to_near(scene, camera)[0])
+        spans = (self._ground(camera), self._columns_in(jax.vmap(lambda solid: self._sides(solid, camera))(solids)))
+        # Without the barrier, XLA works out every span anew for every pixel in it.
+        ground, outlines, kind = jax.lax.optimization_barrier((*spans, solids.kind))
+        image = jnp.where(ground.cover(self._lines.columns), GROUND, SPACE)
+        for number in range(len(solids.kind)):
+            image = jnp.where(_take(outlines, number).cover(self._lines.columns), kind[number], image)
+        return image, jnp.zeros(len(self._rows), bool)
 
-    def _power(self, scene: Scene, camera: CameraPose) -> Float32[Array, "solids"]:
-        """The camera's power in each solid's bounding circle: smaller is in front."""
-        xy, shape = self._xy_and_shape(scene)
+    def _paint_seen(self, scene: Scene, camera: CameraPose) -> Picture:
+        span, shadows = jax.lax.optimization_barrier((self._ground(camera), self._shadows(scene, camera)))
+        add_ground = self._ground_painter(span, shadows, scene, camera)
+        box = self._ground_box(span)
+        picture = paint_in_windows(Picture.of_space(self._lines), box, add_ground, self._lines, GROUND_WINDOW)
+
+        def add(solid: Solid, picture: Picture) -> Picture:
+            sides = self._sides(solid, camera)
+            paint = self._solid_painter(self._columns_in(sides), self._faces(solid, scene, camera), solid.kind)
+            return paint_in_windows(picture, sides.box(), paint, self._lines, COLOUR_WINDOW)
+
+        return self._add_seen(scene, camera, picture, add)
+
+    def _paint_all(self, scene: Scene, camera: CameraPose) -> Picture:
+        solids = self._solids(scene, camera, self._far_to_near(scene, camera)[0])
+        outlines = self._columns_in(jax.vmap(lambda solid: self._sides(solid, camera))(solids))
+        faces = jax.vmap(lambda solid: self._faces(solid, scene, camera))(solids)
+        layers = (self._ground(camera), self._shadows(scene, camera), outlines, faces, solids.kind)
+        span, shadows, *seen = jax.lax.optimization_barrier(layers)
+        whole = Window.whole(self._lines)
+        picture = self._ground_painter(span, shadows, scene, camera)(Picture.of_space(self._lines), whole)
+
+        def add(number: Array, picture: Picture) -> Picture:
+            return self._solid_painter(*_take(tuple(seen), number))(picture, whole)
+
+        return jax.lax.fori_loop(0, len(solids.kind), add, picture)
+
+    def _ground_painter(self, span: Columns, shadows: Columns, scene: Scene, camera: CameraPose) -> Paint:
+        """Paints the ground with the shadows (N, rows) on it."""
+
+        def paint(picture: Picture, window: Window) -> Picture:
+            lines = window.lines
+            sun, surface = ground_light(lines.u_px, lines.v_px, camera, scene.sun_direction, self._projection)
+            for number in range(shadows.first.shape[0]):
+                sun = jnp.where(window.cover(_take(shadows, number)), 0.0, sun)
+            return picture.cover(window.cover(span), self._surfaces.light_on(sun) * surface, GROUND)
+
+        return paint
+
+    def _solid_painter(self, span: Columns, faces: Faces, kind: Array) -> Paint:
+        def paint(picture: Picture, window: Window) -> Picture:
+            light = self._surfaces.light_on(face_light(faces, window.lines.u_px, window.lines.v_px))
+            return picture.cover(window.cover(span), light, kind)
+
+        return paint
+
+    def _add_seen(self, scene: Scene, camera: CameraPose, image: Any, add: Callable[["Solid", Any], Any]) -> Any:
+        """``add`` for every solid that may be in view, from far to near."""
+        order, num_seen = self._far_to_near(scene, camera)
+
+        def add_next(place: Array, image: Any) -> Any:
+            return add(_take(self._solids(scene, camera, order[place][None]), 0), image)
+
+        return jax.lax.fori_loop(0, num_seen, add_next, image)
+
+    def _far_to_near(self, scene: Scene, camera: CameraPose) -> tuple[Int32[Array, "solids"], Int32[Array, ""]]:
+        """(the solids' numbers from far to near, those out of view last; how many may be in view)."""
+        xy, shape, _ = _places(scene, self._goal_shape)
         offset = xy - camera.position_m[:2]
-        return jnp.sum(offset**2, axis=1) - jnp.asarray(self._radius_m)[shape] ** 2
+        power = jnp.sum(offset**2, axis=1) - jnp.asarray(self._radius_m)[shape] ** 2
+        middle = jnp.concatenate([xy, jnp.asarray(self._ball_height_m)[shape][:, None]], axis=1)
+        in_camera = rotate(camera_axes(camera), middle - camera.position_m)
+        is_seen = self._projection.may_see(in_camera, jnp.asarray(self._ball_radius_m)[shape])
+        return jnp.argsort(jnp.where(is_seen, -power, jnp.inf)), jnp.sum(is_seen)
+
+    def _solids(self, scene: Scene, camera: CameraPose, numbers: Int32[Array, "K"]) -> "Solid":
+        """Some of the scene's solids, where they stand."""
+        xy, shape, yaw = (values[numbers] for values in _places(scene, self._goal_shape))
+        stand = jax.vmap(Stand.of, in_axes=(0, 0, None))(xy, yaw, camera)
+        return Solid(self._polyhedra.take(shape), stand, jnp.where(shape == self._goal_shape, GOAL, ROCK))
 
     def _ground(self, camera: CameraPose) -> Columns:
-        return self._columns_in(ground(self._map_size_m, camera, self._projection))
+        return self._columns_between(*ground_span(self._map_size_m, camera, self._projection, self._lines.v_px))
 
-    def _outlines(self, polyhedra: Polyhedra, stand: Stand, camera: CameraPose) -> Columns:
-        outline = jax.vmap(lambda solid, place: silhouette(solid, place, camera, self._projection))
-        return self._columns_in(outline(polyhedra, stand))
+    def _ground_box(self, span: Columns) -> Box:
+        """Whole rows, from the first to the last in which there is ground."""
+        where, v_px = span.count > 0, self._lines.v_px
+        top = jnp.min(jnp.where(where, v_px, self._projection.height_px)) - 0.5
+        bottom = jnp.max(jnp.where(where, v_px, 0.0))
+        return Box(jnp.float32(0.0), jnp.float32(self._projection.width_px), top, bottom)
+
+    def _sides(self, solid: "Solid", camera: CameraPose) -> Sides:
+        return silhouette(solid.shape, solid.stand, camera, self._projection)
+
+    def _faces(self, solid: "Solid", scene: Scene, camera: CameraPose) -> Faces:
+        return faces(solid.shape, solid.stand, scene.sun_direction, camera, self._projection)
+
+    def _shadows(self, scene: Scene, camera: CameraPose) -> Columns:
+        """Of every solid, one after another (N, rows)."""
+        solids = self._solids(scene, camera, jnp.arange(scene.rock_shape.shape[0] + 1))
+        cast = jax.vmap(lambda solid: shadow(solid.shape, solid.stand, scene.sun_direction, camera, self._projection))
+        return self._columns_in(cast(solids))
 
     def _columns_in(self, sides: Sides) -> Columns:
+        return self._columns_between(*spans(sides, self._lines.v_px))
+
+    def _columns_between(self, left_px: Array, right_px: Array) -> Columns:
         """The columns whose centres are in [left, right), in every wanted row."""
         width = self._projection.width_px
-        first, end = (jnp.ceil(jnp.clip(u, 0.0, width) - 0.5) for u in spans(sides, self._lines().v_px))
+        first, end = (jnp.ceil(jnp.clip(u, 0.0, width) - 0.5) for u in (left_px, right_px))
         count = jnp.maximum(end - first, 0.0)
         return Columns(first=first.astype(jnp.uint16), count=count.astype(jnp.uint16))
 
+    @property
     def _lines(self) -> Lines:
         return Lines.of(self._rows, self._columns)
 
 
-def _each(spans: Columns) -> list[Columns]:
-    """One ``Columns`` without leading axis for each of several."""
-    return [jax.tree.map(lambda array, k=k: array[k], spans) for k in range(spans.first.shape[0])]
+def _places(scene: Scene, goal_shape: int) -> tuple[Array, Array, Array]:
+    """(place, number in the library, yaw) of every rock and, last, of the goal."""
+    xy = jnp.concatenate([scene.rock_xy_m, scene.goal_xy_m[None]])
+    yaw = jnp.append(scene.rock_yaw_rad, scene.goal_yaw_rad)
+    return xy, jnp.append(scene.rock_shape, goal_shape), yaw
+
+
+def _take(arrays: Any, number: int | Array) -> Any:
+    """One of several, from a pytree with a leading axis."""
+    return jax.tree.map(lambda array: array[number], arrays)
 
 
 def _require_lines(lines: np.ndarray, size: int, name: str) -> None:
