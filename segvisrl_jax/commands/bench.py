@@ -4,45 +4,51 @@ import functools
 import json
 import platform
 import statistics
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import tyro
+
 from segvisrl_jax.cli import parse
 from segvisrl_jax.config import (
     Arch,
     ConfigError,
     EngineName,
+    EnvConfig,
     PresetName,
-    RendererName,
     preset_config,
     replace_fields,
     require,
 )
 
 Part = Literal["physics", "render", "train"]
+PlainRenderer = Literal["scanline", "gl", "warp", "mujoco.Renderer"]
+"""The project's renderers, and MuJoCo's Python class as one would use it without this project."""
 
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """Times parts of the pipeline: medians of repeats, compilation apart."""
+    """Times parts of the pipeline: medians of repeats, compilation apart. Prints tables; JSON where asked."""
 
-    parts: tuple[Part, ...] = ("physics", "render", "train")
+    parts: tyro.conf.Positional[tuple[Part, ...]] = ("physics", "render", "train")
+    """physics, render, train; all where none is named."""
     batch: int = 32
-    """Environments at once."""
+    """Environments at once, for physics."""
     batches: tuple[int, ...] = (1, 16, 64, 256)
     """Frames at once, for the renderers."""
     scale: float = 10.0
     """Downsampling of the 1920 x 1080 image, for the renderers (paper: 10)."""
-    num_rocks: int = 4
+    num_rocks: tuple[int, ...] = (4,)
     """Rocks in the renderers' scenes."""
     repeats: int = 5
     arch: Arch = "cnn_lstm"
     preset: PresetName = "cpu"
     engines: tuple[EngineName, ...] = ("native", "mjx")
-    renderers: tuple[RendererName, ...] = ("scanline", "gl")
+    renderers: tuple[PlainRenderer, ...] = ("scanline", "gl", "warp", "mujoco.Renderer")
     json: Path | None = None
     """Where to write the result as JSON."""
 
@@ -51,19 +57,26 @@ class BenchOptions:
         for batch in self.batches:
             require(1 <= batch <= 65536, "--batches", batch, "in [1, 65536]")
         require(1 <= self.repeats <= 1000, "--repeats", self.repeats, "in [1, 1000]")
+        folder_exists = self.json is None or self.json.resolve().parent.is_dir()
+        require(folder_exists, "--json", str(self.json), "in a folder that exists")
 
 
 def run(options: Sequence[str]) -> int:
-    """Parses, measures, prints a table; writes JSON where asked."""
+    """Parses, measures, prints a table for each part; writes JSON where asked."""
     asked = parse(BenchOptions, options, "bench")
-    rows: list[dict[str, Any]] = []
     measure = {"physics": _physics, "render": _render, "train": _train}
+    before = machine()
+    rows: list[dict[str, Any]] = []
     for part in asked.parts:
+        measured = []
         for row in measure[part](asked):
-            rows.append({"part": part, **row})
-            _print_row(rows[-1])
+            measured.append(row)
+            print(f"{part}: {len(measured)} rows measured", end="\r", file=sys.stderr, flush=True)
+        _print_table(part, measured)
+        rows += [{"part": part, **row} for row in measured]
     if asked.json is not None:
-        asked.json.write_text(json.dumps({"machine": machine(), "rows": rows}, indent=2) + "\n")
+        command = " ".join(["segvisrl bench", *options])
+        asked.json.write_text(json.dumps({"command": command, "machine": before, "rows": rows}, indent=2) + "\n")
     return 0
 
 
@@ -76,6 +89,8 @@ def machine() -> dict[str, Any]:
 
     packages = ("jax", "mujoco", "mujoco-mjx", "flax")
     return {
+        "processor": _processor(),
+        "load_before": round(os.getloadavg()[0], 2),
         "devices": [device.device_kind for device in jax.devices()],
         "cores": os.cpu_count(),
         "python": platform.python_version(),
@@ -110,46 +125,109 @@ def _physics(asked: BenchOptions):
 
 
 def _render(asked: BenchOptions):
-    """Frames a second of each renderer on the same scenes, and the ratio to the first one that is MuJoCo's (gl)."""
-    config = replace_fields(preset_config("cnn_lstm", asked.preset).env, scale=asked.scale, num_rocks=asked.num_rocks)
-    environments = {name: _env_or_none(replace_fields(config, renderer=name)) for name in asked.renderers}
-    for batch in asked.batches:
-        rows = [_render_row(name, env, batch, asked) for name, env in environments.items() if env is not None]
-        reference = next((row["frames_per_s"] for row in rows if row["name"] == "gl"), None)
-        for row in rows:
-            yield row if reference is None else {**row, "ratio_to_gl": row["frames_per_s"] / reference}
+    """Frames a second of each renderer on the same scenes, and the ratio to MuJoCo's through this project (gl)."""
+    base = replace_fields(preset_config("cnn_lstm", asked.preset).env, scale=asked.scale)
+    for num_rocks in asked.num_rocks:
+        config = replace_fields(base, num_rocks=num_rocks)
+        looks = {name: _look_or_none(name, config) for name in asked.renderers}
+        for batch in asked.batches:
+            timed = [_render_row(name, look, config, batch, asked.repeats) for name, look in looks.items() if look]
+            reference = next((row["frames_per_s"] for row in timed if row["name"] == "gl"), None)
+            for row in timed:
+                yield row if reference is None else {**row, "ratio_to_gl": row["frames_per_s"] / reference}
 
 
-def _render_row(name: str, env: Any, batch: int, asked: BenchOptions) -> dict[str, Any]:
+def _look_or_none(name: str, config: EnvConfig) -> Callable[[Any], Any] | None:
+    """From a batch of states to their observations; None where the renderer cannot run here."""
     import jax
 
-    rover = jax.jit(jax.vmap(env.initial_state))(jax.random.split(jax.random.key(0), batch))
-    compile_s, seconds = _time(functools.partial(jax.jit(jax.vmap(env.observe)), rover), asked.repeats)
-    rows, columns, _ = env.observation_shape
-    source = f"{env.config.camera.width_px} x {env.config.camera.height_px}"
-    row = {"name": name, "image": f"{source} to {columns} x {rows}", "rocks": asked.num_rocks, "batch": batch}
+    if name == "mujoco.Renderer":
+        return _mujoco_look(config)
+    env = _env_or_none(replace_fields(config, renderer=name))
+    return None if env is None else jax.jit(jax.vmap(env.observe))
+
+
+def _mujoco_look(config: EnvConfig) -> Callable[[Any], Any] | None:
+    """``mujoco.Renderer`` with segmentation on, one frame after another, then ``colour_and_resample``."""
+    import jax
+    import mujoco
+    import numpy as np
+    from mujoco.rendering.classic import gl_context
+
+    from segvisrl_jax.env.model import CAMERA_NAME
+    from segvisrl_jax.env.rover_env import RoverEnv
+    from segvisrl_jax.vision.classes import GEOM_PREFIXES, PALETTE
+    from segvisrl_jax.vision.gl_context import open_gl_context
+    from segvisrl_jax.vision.resample import downsample
+
+    gl_context.GLContext = open_gl_context  # else it looks for a display where MUJOCO_GL is not set
+    env = RoverEnv(replace_fields(config, obs="state"))
+    camera, model = config.camera, env.mj_model
+    try:
+        renderer = mujoco.Renderer(model, camera.height_px, camera.width_px)
+    except ConfigError as error:
+        print(f"left out: mujoco.Renderer: {error}", file=sys.stderr)
+        return None
+    renderer.enable_segmentation_rendering()
+    names = [model.geom(geom).name for geom in range(model.ngeom)]
+    of_geom = [next((k for prefix, k in GEOM_PREFIXES.items() if name.startswith(prefix)), 0) for name in names]
+    colours = np.append(PALETTE[of_geom], PALETTE[:1], axis=0)  # what is no geom (-1) is space
+    shrink = jax.jit(lambda image: downsample(image, camera.scale))
+
+    def look(states: Any) -> list[Any]:
+        arrays = jax.tree.map(np.asarray, states)
+        images = []
+        for number in range(len(arrays.num_decisions)):
+            data = env.to_mujoco(jax.tree.map(lambda leaf, number=number: leaf[number], arrays))
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data, CAMERA_NAME)
+            images.append(shrink(colours[renderer.render()[..., 0]]))
+        return images
+
+    return look
+
+
+def _render_row(name: str, look: Callable[[Any], Any], config: EnvConfig, batch: int, repeats: int) -> dict[str, Any]:
+    import jax
+
+    from segvisrl_jax.env.rover_env import RoverEnv
+
+    scenes = RoverEnv(replace_fields(config, obs="state"))
+    states = jax.jit(jax.vmap(scenes.initial_state))(jax.random.split(jax.random.key(0), batch))
+    compile_s, seconds = _time(functools.partial(look, states), repeats)
+    rows, columns = config.camera.observation_size_px
+    image = f"{config.camera.width_px} x {config.camera.height_px} to {columns} x {rows}"
+    row = {"name": name, "image": image, "rocks": config.scene.num_rocks, "batch": batch}
     return {**row, "frames_per_s": batch / seconds, "compile_s": compile_s}
 
 
 def _train(asked: BenchOptions):
+    """Acting and learning; images kept from acting, or drawn again in every epoch."""
     import jax
 
     from segvisrl_jax.training.loop import Trainer
 
     config = preset_config(asked.arch, asked.preset)
-    trainer = Trainer(config)
-    state = trainer.start()
-    images = config.ppo.decisions_per_update * config.ppo.num_epochs
-    _, trajectory, last_value, _ = trainer.act(state)
-    compile_act, act_s = _time(lambda: trainer.act(state), asked.repeats)
-    key = jax.random.key(0)
-    compile_learn, learn_s = _time(
-        lambda: trainer.learner.update(state.learner, trajectory, last_value, key), asked.repeats
-    )
     decisions = config.ppo.decisions_per_update
-    yield {"name": "acting", "decisions_per_s": decisions / act_s, "compile_s": compile_act}
-    yield {"name": "learning", "gradient_images_per_s": images / learn_s, "compile_s": compile_learn}
-    yield {"name": f"{asked.arch}, {asked.preset}", "decisions_per_s": decisions / (act_s + learn_s)}
+    images = decisions * config.ppo.num_epochs
+    sees = config.env.obs != "state"
+    for redraw in (False, True) if sees else (False,):
+        trainer = Trainer(replace_fields(config, redraw_observations=redraw, kl_stop=0.0))
+        state = trainer.start()
+        _, trajectory, last_value, _ = trainer.act(state)
+        compile_act, act_s = _time(functools.partial(trainer.act, state), asked.repeats)
+        learn = functools.partial(trainer.learner.update, state.learner, trajectory, last_value, jax.random.key(0))
+        compile_learn, learn_s = _time(learn, asked.repeats)
+        kept = sum(leaf.nbytes for leaf in jax.tree.leaves(trajectory.observation))
+        yield {
+            "name": f"{asked.arch}, {asked.preset}",
+            "observations": "drawn again" if redraw else "kept",
+            "observation_mib": kept / 2**20,
+            "acting_decisions_per_s": decisions / act_s,
+            "gradient_images_per_s": images / learn_s,
+            "decisions_per_s": decisions / (act_s + learn_s),
+            "compile_s": compile_act + compile_learn,
+        }
 
 
 def _env_or_none(config):
@@ -159,7 +237,7 @@ def _env_or_none(config):
     try:
         return RoverEnv(config)
     except ConfigError as error:
-        print(f"left out: {error}")
+        print(f"left out: {error}", file=sys.stderr)
         return None
 
 
@@ -175,10 +253,21 @@ def _time(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
     return once(), statistics.median(once() for _ in range(repeats))
 
 
-def _print_row(row: dict[str, Any]) -> None:
-    shown = [
-        f"{name.replace('_', ' ')} {value:,.1f}" if isinstance(value, float) else str(value)
-        for name, value in row.items()
-        if name != "part"
-    ]
-    print(f"{row['part']:<8} {'  '.join(shown)}", flush=True)
+def _processor() -> str:
+    """The processor's name, where the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def _print_table(part: str, rows: Sequence[dict[str, Any]]) -> None:
+    """A markdown table with a column for every name in any row."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    print(f"{part}\n| {' | '.join(name.replace('_', ' ') for name in names)} |")
+    print("|" + "---|" * len(names))
+    for row in rows:
+        cells = [f"{v:,.1f}" if isinstance(v := row.get(name, ""), float) else str(v) for name in names]
+        print(f"| {' | '.join(cells)} |")
+    print(flush=True)

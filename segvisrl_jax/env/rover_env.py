@@ -1,6 +1,7 @@
 """``RoverEnv``: scene, physics, task and camera composed into ``reset(key)`` and ``step(state, action)``."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -28,7 +29,7 @@ from segvisrl_jax.types import (
 )
 from segvisrl_jax.vision.batching import one_by_one_on_cpu
 from segvisrl_jax.vision.classes import PALETTE
-from segvisrl_jax.vision.renderer import InGraphRenderer, make_renderer
+from segvisrl_jax.vision.renderer import InGraphRenderer, Renderer, make_renderer
 from segvisrl_jax.vision.resample import colour_and_resample, resample_taps, tap_plan
 
 TYPICAL_TURN_RATE_RAD_S = 0.5  # scales the turn rate in the state observation to about 1
@@ -63,13 +64,12 @@ class RoverEnv(Env):
         self._mount = camera_mount(self.mj_model)
         camera = config.camera
         self._plan = tap_plan(camera.height_px, camera.width_px, camera.scale)
-        self.renderer = None
+        self.renderer = self._look = None
         if config.obs != "state":
             rows, self._row_taps = np.unique(self._plan.rows, return_inverse=True)
             columns, self._column_taps = np.unique(self._plan.columns, return_inverse=True)
             self.renderer = make_renderer(config, rows, columns)
-            look = self._look_at_colours if config.obs == "rgb" else self._look_at_classes
-            self._look = one_by_one_on_cpu(look) if isinstance(self.renderer, InGraphRenderer) else look
+            self._look = self._make_look(self.renderer)
 
     # brax's contract
 
@@ -166,18 +166,24 @@ class RoverEnv(Env):
 
     def observe(self, state: RoverState) -> Observation:
         """What the agent sees now. Unbatched."""
-        if self.renderer is None:
+        if self._look is None:
             return self._state_vector(state)
         return self._look(state.scene, camera_pose(state.physics, self._mount))
 
-    def _look_at_classes(self, scene: Scene, camera: CameraPose) -> UInt8[Array, "H W 3"]:
-        if isinstance(self.renderer, InGraphRenderer):
-            classes, is_plain = self.renderer.classes_and_plain_rows(scene, camera)
-            return colour_and_resample(self._taps(classes), self._plan, PALETTE, is_plain[self._row_taps])
-        return colour_and_resample(self._taps(self.renderer.classes(scene, camera)), self._plan, PALETTE)
+    def _make_look(self, renderer: Renderer) -> Callable[[Scene, CameraPose], UInt8[Array, "H W 3"]]:
+        """What draws and shrinks one image."""
 
-    def _look_at_colours(self, scene: Scene, camera: CameraPose) -> UInt8[Array, "H W 3"]:
-        return resample_taps(self._taps(self.renderer.rgb(scene, camera)), self._plan)
+        def colours(scene: Scene, camera: CameraPose) -> UInt8[Array, "H W 3"]:
+            return resample_taps(self._taps(renderer.rgb(scene, camera)), self._plan)
+
+        def classes(scene: Scene, camera: CameraPose) -> UInt8[Array, "H W 3"]:
+            if not isinstance(renderer, InGraphRenderer):
+                return colour_and_resample(self._taps(renderer.classes(scene, camera)), self._plan, PALETTE)
+            drawn, is_plain = renderer.classes_and_plain_rows(scene, camera)
+            return colour_and_resample(self._taps(drawn), self._plan, PALETTE, is_plain[self._row_taps])
+
+        look = colours if self.config.obs == "rgb" else classes
+        return one_by_one_on_cpu(look) if isinstance(renderer, InGraphRenderer) else look
 
     def _taps(self, drawn: UInt8[Array, "rows columns ..."]) -> UInt8[Array, "taps_h taps_w ..."]:
         """Rows and columns that downsampling reads more than once (at the border, and everywhere below scale 4)."""

@@ -163,16 +163,15 @@ def colour_and_resample(
     """
     _require_array(classes, "classes", plan.tap_size, np.uint8)
     _require_array(palette, "palette", (4, 3), np.uint8)
-    palette = np.asarray(palette)
-    row_weights = jnp.asarray(plan.row_weights)
+    colours, row_weights = np.asarray(palette), jnp.asarray(plan.row_weights)
     if plain_rows is None:
-        return _bytes(_shrink_rows(jnp.asarray(classes), row_weights, plan, palette))
+        return _bytes(_shrink_rows(jnp.asarray(classes), row_weights, plan, colours))
     _require_array(plain_rows, "plain_rows", plan.tap_size[:1], np.bool_)
     words = jax.lax.platform_dependent(
         jnp.asarray(classes),
         plain_rows,
-        cpu=functools.partial(_shrink_mixed_bands, plan=plan, palette=palette),
-        default=lambda classes, _: _shrink_rows(classes, row_weights, plan, palette),
+        cpu=functools.partial(_shrink_mixed_bands, plan=plan, palette=colours),
+        default=lambda classes, _: _shrink_rows(classes, row_weights, plan, colours),
     )
     return _bytes(words)
 
@@ -245,8 +244,8 @@ def _weighted_sum(
             weight = plan.column_weights[None, :, column]
             planes = read(row, column)
             along_columns = [s + p * weight for s, p in zip(along_columns, planes, strict=True)]
-        weight = row_weights[:, None, row]
-        total = [t + s * weight for t, s in zip(total, along_columns, strict=True)]
+        row_weight = row_weights[:, None, row]
+        total = [t + s * row_weight for t, s in zip(total, along_columns, strict=True)]
     return total[0], total[1], total[2]
 
 
