@@ -23,6 +23,8 @@ class SceneConfig:
     """... and at most this far (ours: at 0.16 m/s, 100 s cover 16 m)."""
     num_rocks: int = 4
     """Rocks on the map (paper: 4)."""
+    random_num_rocks: bool = False
+    """Each scene has a uniformly random number of rocks from 0 to num_rocks (ours; for training)."""
     rock_start_clearance_m: float = 4.0
     """Least distance of a rock's centre from the start (paper)."""
     rock_goal_clearance_m: float = 1.75
@@ -62,6 +64,7 @@ class SceneConfig:
         )
         require(self.num_rock_shapes >= 1, f"{p}.num_rock_shapes", self.num_rock_shapes, "at least 1")
         require(self.num_rock_shapes <= 1024, f"{p}.num_rock_shapes", self.num_rock_shapes, "at most 1024")
+        require(type(self.random_num_rocks) is bool, f"{p}.random_num_rocks", self.random_num_rocks, "True or False")
         rocks = self.num_rocks
         require(rocks >= 0, f"{p}.num_rocks", rocks, "0 or more")
         require(

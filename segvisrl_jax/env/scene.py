@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float32, PRNGKeyArray
 from segvisrl_jax.config import SceneConfig
 from segvisrl_jax.types import ConvexSolids, Scene
 
-FAR_AWAY_M = 1e4  # where a rock stands that has not been placed yet: it keeps nothing clear
+FAR_AWAY_M = 1e4  # where a rock stands that has not been placed, or not yet: it keeps nothing clear
 
 
 def sample_scene(key: PRNGKeyArray, config: SceneConfig, rocks: ConvexSolids) -> Scene:
@@ -26,13 +26,16 @@ def sample_scene(key: PRNGKeyArray, config: SceneConfig, rocks: ConvexSolids) ->
     Returns:
         A scene with ``config.num_rocks`` rocks: the goal uniform over the part of the map between the least and the
         largest distance from the start; each rock uniform over the part of the map that keeps clear of start, goal
-        and earlier rocks, each of a different shape.
+        and earlier rocks, each of a different shape. With ``random_num_rocks``, some of them stand far outside the map.
     """
     goal_key, shape_key, place_key, yaw_key, start_key = jax.random.split(key, 5)
     goal_xy = _sample_goal(goal_key, config)
     shape = jax.random.permutation(shape_key, config.num_rock_shapes)[: config.num_rocks]
     shape = shape.astype(jnp.int32)
     rock_xy = _place_rocks(place_key, config, goal_xy, jnp.asarray(rocks.radius_m)[shape])
+    if config.random_num_rocks:
+        number = jax.random.randint(jax.random.fold_in(shape_key, 1), (), 0, config.num_rocks + 1)
+        rock_xy = jnp.where(jnp.arange(config.num_rocks)[:, None] < number, rock_xy, FAR_AWAY_M)
     yaw = jax.random.uniform(yaw_key, (config.num_rocks + 1,), minval=-jnp.pi, maxval=jnp.pi)
     return Scene(
         goal_xy_m=goal_xy,

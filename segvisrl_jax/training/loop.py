@@ -102,8 +102,8 @@ class Trainer:
 
 
 def held_out_env(config: EnvConfig) -> EnvConfig:
-    """The same world with the paper's start, whatever training starts from."""
-    return replace_fields(config, random_start_yaw_share=0.0)
+    """The same world with the paper's start and all the rocks, whatever training starts from."""
+    return replace_fields(config, random_start_yaw_share=0.0, random_num_rocks=False)
 
 
 def train(config: TrainConfig, say=print) -> TrainResult:

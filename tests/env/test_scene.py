@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from segvisrl_jax.config import ConfigError, EnvConfig, SceneConfig, replace_fields
 from segvisrl_jax.env.rocks import MAX_FACES, MIN_FACES, goal_beacon, rock_library
 from segvisrl_jax.env.scene import sample_scene, sun_direction
+from segvisrl_jax.training.loop import held_out_env
 
 NUM_KEYS = 4096
 ROUNDING_M = 1e-4
@@ -175,3 +176,13 @@ def test_sampling_is_jittable_and_typed():
     floats = [one.goal_xy_m, one.rock_xy_m, one.rock_yaw_rad, one.start_yaw_rad, one.sun_direction]
     assert all(leaf.dtype == jnp.float32 for leaf in floats)
     assert not any(getattr(leaf, "weak_type", False) for leaf in jax.tree.leaves(one))
+
+
+def test_a_random_number_of_rocks_is_uniform_from_none_to_all():
+    config = SceneConfig(num_rocks=4, random_num_rocks=True)
+    scene = scenes(config, 7)
+    is_placed = np.all(np.abs(scene.rock_xy_m) <= config.map_size_m / 2, axis=-1)
+    share = np.bincount(is_placed.sum(axis=-1), minlength=5) / NUM_KEYS
+    np.testing.assert_allclose(share, 0.2, atol=0.03)  # 5 standard deviations
+    assert np.all(np.linalg.norm(scene.rock_xy_m, axis=-1)[~is_placed] > 1000)
+    assert not held_out_env(EnvConfig(scene=config)).scene.random_num_rocks
