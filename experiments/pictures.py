@@ -1,9 +1,11 @@
 # %% [markdown]
 # # The rover and what it sees
 # Draws the rover among rocks from outside (MuJoCo's renderer, so this one needs OpenGL), and the steps of the
-# preprocessing (paper, figure 3): raw image, segmentation, what the policy gets.
+# preprocessing (paper, figure 3): raw image, segmentation, what the policy gets, and what is left where the image is
+# shrunk too far.
 #
-# `python experiments/pictures.py [OUTPUT_FOLDER]`, by default docs/images.
+# `python experiments/pictures.py [OUTPUT_FOLDER]`, by default docs/images; needs OpenGL. It takes about 20 seconds.
+# Writes rover.png and preprocessing.png.
 
 # %%
 import sys
@@ -14,17 +16,20 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from scipy.ndimage import label
 
 import segvisrl_jax
 from segvisrl_jax.config import replace_fields
 from segvisrl_jax.env.pose import camera_mount, camera_pose
 from segvisrl_jax.report.scene_figures import preprocessing
+from segvisrl_jax.vision.classes import PALETTE, SegmentationClass
 from segvisrl_jax.vision.gl_context import open_draw_context
 from segvisrl_jax.vision.renderer import make_renderer
 
 IS_SCRIPT = "__file__" in globals()
 OUTPUT = Path(sys.argv[1]) if IS_SCRIPT and len(sys.argv) > 1 else Path("docs/images")
 OUTPUT.mkdir(parents=True, exist_ok=True)
+SCALES = {"Scale 10 (paper)": 10, "Scale 40 (cpu preset)": 40, "Scale 80": 80, "Scale 120, too far": 120}
 
 # %% A scene with rocks close by, so that there is something to see
 env = segvisrl_jax.make_env(obs="rgb", num_rocks=8)
@@ -63,6 +68,21 @@ rows, columns = np.arange(1080), np.arange(1920)
 renderer = make_renderer(full, rows, columns)
 pose = camera_pose(state.physics, camera_mount(model))
 raw, classes = jax.jit(lambda: (renderer.rgb(scene, pose), renderer.classes(scene, pose)))()
-seen = segvisrl_jax.downsample(jnp.asarray(segvisrl_jax.vision.classes.PALETTE)[classes], 10)
-preprocessing(np.asarray(raw), np.asarray(classes), np.asarray(seen), OUTPUT / "preprocessing.png")
+segmented = jnp.asarray(PALETTE)[classes]
+seen = {name: np.asarray(segvisrl_jax.downsample(segmented, scale)) for name, scale in SCALES.items()}
+preprocessing(np.asarray(raw), np.asarray(classes), seen, OUTPUT / "preprocessing.png")
+
+
+# %% What is left of the rocks and of the goal
+def nearest_class(image):
+    return np.argmin(np.abs(image[:, :, None].astype(int) - PALETTE).sum(axis=-1), axis=-1)
+
+
+print("| image | size | separate patches of rock | rock [% of pixels] | goal [% of pixels] |")
+print("|---|---|---|---|---|")
+kinds = {"Segmented": np.asarray(classes)} | {name: nearest_class(image) for name, image in seen.items()}
+for name, kind in kinds.items():
+    rocks, goal = kind == SegmentationClass.ROCK, kind == SegmentationClass.GOAL
+    size = f"{kind.shape[1]} x {kind.shape[0]}"
+    print(f"| {name} | {size} | {label(rocks)[1]} | {100 * rocks.mean():.2f} | {100 * goal.mean():.2f} |")
 print(OUTPUT / "rover.png", OUTPUT / "preprocessing.png")

@@ -2,7 +2,8 @@
 # # Does it matter who draws?
 # The shipped `cnn_lstm` drives the same test scenes twice: seeing through `scanline` and through MuJoCo's own renderer.
 #
-# `python experiments/policy_through_renderers.py [EPISODES]`; needs OpenGL. 40 episodes take about a minute.
+# `python experiments/policy_through_renderers.py [EPISODES]`, by default 40; needs OpenGL. 40 episodes take about a
+# minute. Writes no picture.
 
 # %%
 import sys

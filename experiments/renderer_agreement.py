@@ -3,7 +3,8 @@
 # Draws random frames (driving poses, close rocks, tilted cameras) at 1920 x 1080 with `scanline` and with MuJoCo's own
 # renderer, counts the pixels whose class differs, and compares what the policy would get at scale 10.
 #
-# `python experiments/renderer_agreement.py [FRAMES] [OUTPUT_FOLDER]`; needs OpenGL. 60 frames take about a minute.
+# `python experiments/renderer_agreement.py [FRAMES] [OUTPUT_FOLDER]`, by default 60 and docs/images; needs OpenGL. 60
+# frames take about a minute. Writes renderer_agreement.png.
 
 # %%
 import sys

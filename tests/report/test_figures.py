@@ -138,17 +138,22 @@ def test_trajectories_without_rocks_or_paths(tmp_path):
     trajectories(scene_map(rocks=()), [], tmp_path / "scene.png")
 
 
-def test_preprocessing_shows_the_three_images_in_a_row(tmp_path, drawn):
+def test_preprocessing_shows_every_step(tmp_path, drawn):
     classes = np.zeros((108, 192), np.uint8)
     classes[54:] = 1
     classes[50:60, 40:60] = 2
     raw = np.full((108, 192, 3), 77, np.uint8)
-    observation = PALETTE[classes[::10, ::10]]
-    image = iio.imread(preprocessing(raw, classes, observation, tmp_path / "steps.png"))
-    assert image.shape[1] >= 1000
-    shown = [axes.get_images()[0].get_array() for axes in drawn[0].axes]
+    fine, coarse = (PALETTE[classes[::scale, ::scale]] for scale in (10, 40))
+    images = [iio.imread(preprocessing(raw, classes, {"Observation": fine}, tmp_path / "steps.png"))]
+    more = {"Fine": fine, "Coarse": coarse}
+    images.append(iio.imread(preprocessing(raw, classes, more, tmp_path / "more.png")))
+    assert min(image.shape[1] for image in images) >= 1000
+    assert images[1].shape[0] > 1.5 * images[0].shape[0]  # a second row
+    shown = [axes.get_images()[0].get_array() for axes in drawn[1].axes]
     np.testing.assert_array_equal(shown[0], raw)
     np.testing.assert_array_equal(shown[1][55, 50], PALETTE[2])
-    np.testing.assert_array_equal(shown[2], observation)
-    titles = [axes.get_title() for axes in drawn[0].axes]
-    assert titles == ["Camera, 192 x 108", "Segmented, 192 x 108", "Observation, 20 x 11"]
+    np.testing.assert_array_equal(shown[2], fine)
+    np.testing.assert_array_equal(shown[3], coarse)
+    titles = [[axes.get_title() for axes in figure.axes] for figure in drawn]
+    assert titles[0] == ["Camera, 192 x 108", "Segmented, 192 x 108", "Observation, 20 x 11"]
+    assert titles[1][2:] == ["Fine, 20 x 11", "Coarse, 5 x 3"]
