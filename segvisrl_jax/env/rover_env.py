@@ -168,7 +168,11 @@ class RoverEnv(Env):
         """What the agent sees now. Unbatched."""
         if self._look is None:
             return self._state_vector(state)
-        return self._look(state.scene, camera_pose(state.physics, self._mount))
+        return self._look(state.scene, self.camera(state))
+
+    def camera(self, state: RoverState) -> CameraPose:
+        """Where the camera is and how it looks. Unbatched."""
+        return camera_pose(state.physics, self._mount)
 
     def _make_look(self, renderer: Renderer) -> Callable[[Scene, CameraPose], UInt8[Array, "H W 3"]]:
         """What draws and shrinks one image."""

@@ -6,6 +6,7 @@ MuJoCo's; the ground's relief is ours. This file does not know rows, spans or or
 """
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +24,10 @@ from segvisrl_jax.vision.projection import Projection, Stand, camera_axes, rotat
 STEP_X, STEP_Y, SEED_STEP, MIXER = 0x9E3779B1, 0x85EBCA77, 0x27D4EB2F, 0xC2B2AE3D
 """Large odd numbers (the primes of the xxHash function): they scatter neighbours over all 32 bits."""
 PART_BITS = 10  # three random numbers from one word
-MAX_CRATER_RADIUS = 0.4  # of its cell's side: craters of one size do not meet
+MAX_CRATER_REACH = 0.4  # from its middle to where its rim's outer slope ends, of its cell's side: craters do not meet
+CRATER_SCALE = 3.8  # makes the steepest slope 1
+RIM_REACH = 1.5  # where that is, in radii
+TURN_RAD = 0.65  # between the grids of one form and the next, so that no lines of cells show
 STAIN = 0.06  # how much lighter and darker the ground is where it is high and low, as a share
 FADE_PX = 4.0  # a wave shorter than this many source pixels has faded out: downsampling would alias it
 LOWEST_SLOPE = 1e-4  # least steepness of a ray that meets the ground; flatter ones pass the far plane first
@@ -86,11 +90,12 @@ def ground_light(
     footprint = depth**2 / (projection.focal_px * jnp.maximum(camera.position_m[2], LOWEST_SLOPE))
     height, slope_x, slope_y = jnp.zeros_like(x), jnp.zeros_like(x), jnp.zeros_like(x)
     for seed, (make, size, steepness) in enumerate(RELIEF):
-        form = make(x / size, y / size, seed)
+        cos, sin = math.cos(TURN_RAD * seed), math.sin(TURN_RAD * seed)
+        form = make((cos * x + sin * y) / size, (cos * y - sin * x) / size, seed)
         strength = jnp.clip(2.0 - 2.0 * FADE_PX * footprint / size, 0.0, 1.0)
         height += strength * form[0] / len(RELIEF)
-        slope_x += strength * steepness * form[1]
-        slope_y += strength * steepness * form[2]
+        slope_x += strength * steepness * (cos * form[1] - sin * form[2])
+        slope_y += strength * steepness * (sin * form[1] + cos * form[2])
     sun = sun_direction[2] - slope_x * sun_direction[0] - slope_y * sun_direction[1]
     return jnp.where(sun_direction[2] > 0.0, jnp.maximum(sun, 0.0), 0.0), 1.0 + STAIN * height
 
@@ -107,15 +112,18 @@ def _waves(x: Array, y: Array, seed: int) -> tuple[Array, Array, Array]:
 
 
 def _craters(x: Array, y: Array, seed: int) -> tuple[Array, Array, Array]:
-    """One round bowl in every unit cell: (0, its slope in x, in y), at most 1, level at rim and middle."""
+    """One round bowl with a raised rim in every unit cell: (0, its slope in x, in y), at most about 1.
+
+    In radii d, the slope is d (1 - d) (1.5 - d), scaled: up from the middle to the rim at 1, down to the plain at 1.5.
+    """
     in_x, in_y, key = _cell(x, y, seed)
     bits = _mix(key)
-    away_x = in_x - 0.5 - (0.5 - MAX_CRATER_RADIUS) * _part(bits, 0)
-    away_y = in_y - 0.5 - (0.5 - MAX_CRATER_RADIUS) * _part(bits, PART_BITS)
-    per_radius = (2.5 + 1.5 * _part(bits, 2 * PART_BITS)) / MAX_CRATER_RADIUS
+    away_x = in_x - 0.5 - (0.5 - MAX_CRATER_REACH) * _part(bits, 0)
+    away_y = in_y - 0.5 - (0.5 - MAX_CRATER_REACH) * _part(bits, PART_BITS)
+    per_radius = (2.5 + 1.5 * _part(bits, 2 * PART_BITS)) * RIM_REACH / MAX_CRATER_REACH
     distance = jnp.sqrt(away_x**2 + away_y**2) * per_radius
-    slope = 4.0 * per_radius * jnp.maximum(1.0 - distance, 0.0)
-    return jnp.zeros_like(x), slope * away_x, slope * away_y
+    outwards = CRATER_SCALE * per_radius * (1.0 - distance) * jnp.maximum(RIM_REACH - distance, 0.0)
+    return jnp.zeros_like(x), outwards * away_x, outwards * away_y
 
 
 def _cell(x: Array, y: Array, seed: int) -> tuple[Array, Array, UInt32[Array, "*P"]]:
@@ -144,10 +152,11 @@ def _part(bits: UInt32[Array, "*P"], lowest: int) -> Float32[Array, "*P"]:
 
 
 RELIEF = (
-    (_craters, 3.1, 0.20),
-    (_craters, 0.9, 0.25),
+    (_craters, 3.1, 0.25),
+    (_craters, 0.9, 0.30),
     (_waves, 0.35, 0.06),
-    (_waves, 0.09, 0.08),
+    (_waves, 0.10, 0.07),
+    (_waves, 0.03, 0.06),
 )
 """The ground's unevenness: (form, size of its cells in metres, steepness). Gently rolling regolith
 with shallow craters. It is light and shade only; the ground's shape is flat."""

@@ -44,6 +44,9 @@ def segvisrl(*words, cwd):
         (["eval", "--policy", "nowhere"], ["nowhere", "policy.json"]),
         (["eval", "--run", "nowhere"], ["nowhere", "policy"]),
         (["demo", "--controller", "p", "--output", "x.avi"], ["--output", "x.avi", ".mp4"]),
+        (["bench", "fly"], ["fly", "physics"]),
+        (["bench", "render", "--batches", "0"], ["--batches", "0"]),
+        (["bench", "render", "--json", "no/such/folder/x.json"], ["--json", "folder that exists"]),
         (["sweep", "--scales", "900"], ["scale", "900", "at least 4 pixels"]),
     ],
 )
@@ -85,6 +88,33 @@ def test_train_eval_demo_as_a_user_does(arch, tmp_path):
     assert set(result) >= SUMMARY_KEYS
     assert result["success"] + result["collision"] + result["fall"] + result["timeout"] == pytest.approx(1)
     assert result["config"]["scene"]["num_rocks"] == 2
+
+
+def test_bench_prints_a_table_and_writes_the_same_numbers(tmp_path):
+    words = [
+        "bench",
+        "physics",
+        "render",
+        "--engines",
+        "native",
+        "--batch",
+        "2",
+        "--batches",
+        "1",
+        "3",
+        "--scale",
+        "120",
+    ]
+    done = segvisrl(*words, "--renderers", "scanline", "--repeats", "1", "--json", "b.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "b.json").read_text())
+    assert [(row["part"], row["name"], row["batch"]) for row in result["rows"]] == [
+        ("physics", "native", 2), ("render", "scanline", 1), ("render", "scanline", 3),
+    ]  # fmt: skip
+    assert all(row.get("frames_per_s", row.get("decisions_per_s")) > 0 for row in result["rows"])
+    assert done.stdout.count("| scanline | 1920 x 1080 to 16 x 9 | 4 |") == 2
+    assert result["command"].startswith("segvisrl bench physics render")
+    assert result["machine"]["cores"] == os.cpu_count()
 
 
 def test_controllers_need_no_images(tmp_path):

@@ -112,6 +112,22 @@ def test_one_class_gives_its_colour():
         assert np.all(np.asarray(image) == colour)
 
 
+@pytest.mark.parametrize("scale", [3, 10, 40])
+@pytest.mark.parametrize("mixed_share", [0.0, 0.02, 0.5])
+def test_leaving_plain_rows_out_changes_nothing(scale, mixed_share):
+    plan = tap_plan(1080, 1920, scale)
+    rng = np.random.default_rng(0)
+    classes = np.repeat(np.sort(rng.integers(0, 4, plan.tap_size[0]))[:, None], plan.tap_size[1], axis=1).astype(
+        np.uint8
+    )
+    is_plain = rng.uniform(size=plan.tap_size[0]) >= mixed_share
+    classes[~is_plain] = rng.integers(0, 4, (np.count_nonzero(~is_plain), plan.tap_size[1]))
+    draw = jax.jit(lambda classes, plain: colour_and_resample(classes, plan, PALETTE, plain))
+    everything = jax.jit(lambda classes: colour_and_resample(classes, plan, PALETTE))(classes)
+    np.testing.assert_array_equal(draw(classes, is_plain), everything)
+    np.testing.assert_array_equal(draw(classes, np.zeros_like(is_plain)), everything)
+
+
 def test_colouring_is_the_same_under_map_and_vmap():
     plan = tap_plan(1080, 1920, 10)
     batch = np.stack([random_classes(plan, seed) for seed in range(3)])
@@ -170,6 +186,8 @@ def test_wrong_taps_classes_and_palettes_are_refused():
         colour_and_resample(good.astype(np.int32), plan, PALETTE)
     with pytest.raises(ConfigError, match=r"palette\.shape"):
         colour_and_resample(good, plan, PALETTE[:3])
+    with pytest.raises(ConfigError, match=r"plain_rows\.shape"):
+        colour_and_resample(good, plan, PALETTE, np.zeros(79, bool))
 
 
 def test_a_traced_scale_is_refused():
