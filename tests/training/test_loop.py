@@ -138,3 +138,15 @@ def test_evaluation_starts_as_the_paper_does_whatever_training_does():
     config = preset_config("cnn_lstm", "cpu")
     assert config.env.scene.random_start_yaw_share > 0
     assert loop.held_out_env(config.env).scene.random_start_yaw_share == 0
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+def test_trains_through_mujocos_renderer_too():
+    config = replace_fields(preset_config("cnn_lstm", "smoke"), renderer="gl", num_envs=2, unroll_length=4)
+    trainer = loop.Trainer(config)
+    before = trainer.start()
+    after, metrics, _ = trainer.update(before)
+    assert all(np.isfinite(value) for value in jax.device_get(metrics).values())
+    moved = jax.tree.map(lambda a, b: bool(np.any(a != b)), before.learner.params, after.learner.params)
+    assert all(jax.tree.leaves(moved))
