@@ -25,6 +25,7 @@ from segvisrl_jax.config import (
     require,
 )
 
+LEAST_TIMED_S = 0.1  # what is shorter is drowned in noise
 Part = Literal["physics", "render", "train"]
 PlainRenderer = Literal["scanline", "gl", "warp", "mujoco.Renderer"]
 """The project's renderers, and MuJoCo's Python class as one would use it without this project."""
@@ -242,15 +243,18 @@ def _env_or_none(config):
 
 
 def _time(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
-    """(seconds of the first call, median seconds of the others)."""
+    """(seconds of the first call, median seconds of a call). Short calls are timed several at a time."""
     import jax
 
-    def once() -> float:
+    def seconds(calls: int) -> float:
         began = time.perf_counter()
-        jax.block_until_ready(call())
-        return time.perf_counter() - began
+        for _ in range(calls):
+            jax.block_until_ready(call())
+        return (time.perf_counter() - began) / calls
 
-    return once(), statistics.median(once() for _ in range(repeats))
+    first, second = seconds(1), seconds(1)
+    calls = max(1, round(LEAST_TIMED_S / second))
+    return first, statistics.median(seconds(calls) for _ in range(repeats))
 
 
 def _processor() -> str:

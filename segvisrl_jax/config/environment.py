@@ -104,6 +104,8 @@ class TaskConfig:
     """Time limit of an episode (paper)."""
     collision_radius_m: float = 0.5
     """Collision: the rover within this distance of a rock's centre (paper)."""
+    collision_margin_m: float = 0.0
+    """In training, a collision is judged this much farther from a rock (ours; held-out scenes have no margin)."""
     goal_radius_m: float = 1.0
     """Success: the rover within this distance of the goal's centre (paper)."""
     max_tilt_deg: float = 60.0
@@ -127,6 +129,8 @@ class TaskConfig:
         require_divides(self.judge_dt_s, self.decision_dt_s, f"{p}.judge_dt_s", f"{p}.decision_dt_s")
         require(1 <= self.max_decisions <= 10**6, f"{p}.max_decisions", self.max_decisions, "in [1, 1000000]")
         require(self.collision_radius_m > 0, f"{p}.collision_radius_m", self.collision_radius_m, "positive")
+        margin = self.collision_margin_m
+        require(0 <= margin <= 10, f"{p}.collision_margin_m", margin, "in [0, 10] metres")
         require(self.goal_radius_m > 0, f"{p}.goal_radius_m", self.goal_radius_m, "positive")
         require(0 < self.max_tilt_deg < 180, f"{p}.max_tilt_deg", self.max_tilt_deg, "in (0, 180)")
 
@@ -225,6 +229,6 @@ class EnvConfig:
             f"below task.collision_radius_m = {limit}, so that a collision is judged before the rover touches the rock"
         )
         require(radius < limit, "scene.rock_radius_max_m", radius, should)
-        clearance, needed = self.scene.rock_goal_clearance_m, limit
-        should = f"more than task.collision_radius_m = {needed}, so that the goal can be reached"
+        clearance, needed = self.scene.rock_goal_clearance_m, limit + self.task.collision_margin_m
+        should = f"more than task.collision_radius_m + collision_margin_m = {needed}, so that the goal can be reached"
         require(clearance > needed, "scene.rock_goal_clearance_m", clearance, should)

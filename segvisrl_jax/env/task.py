@@ -76,7 +76,7 @@ def outcome_at_instants(track: Track, scene: Scene, task: TaskConfig, rules: Sce
     is_success = goal_distance < task.goal_radius_m
     is_off_map = jnp.any(jnp.abs(track.xy_m) > rules.map_size_m / 2, axis=-1)
     is_fall = is_off_map | (track.up_z < jnp.cos(jnp.radians(task.max_tilt_deg)))
-    is_collision = rock_clearance_m(track.xy_m, scene) < task.collision_radius_m
+    is_collision = rock_clearance_m(track.xy_m, scene) < task.collision_radius_m + task.collision_margin_m
     by_rank = [~track.is_finite, is_collision, is_fall, is_success]
     outcomes = [Outcome.UNSTABLE, Outcome.COLLISION, Outcome.FALL, Outcome.SUCCESS]
     choices = [jnp.int32(outcome) for outcome in outcomes]

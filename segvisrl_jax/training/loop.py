@@ -102,8 +102,8 @@ class Trainer:
 
 
 def held_out_env(config: EnvConfig) -> EnvConfig:
-    """The same world with the paper's start and all the rocks, whatever training starts from."""
-    return replace_fields(config, random_start_yaw_share=0.0, random_num_rocks=False)
+    """The same world with the paper's start, all the rocks and no margin, whatever training is made of."""
+    return replace_fields(config, random_start_yaw_share=0.0, random_num_rocks=False, collision_margin_m=0.0)
 
 
 def train(config: TrainConfig, say=print) -> TrainResult:

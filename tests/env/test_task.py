@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from segvisrl_jax.config import SceneConfig, TaskConfig
+from segvisrl_jax.config import EnvConfig, SceneConfig, TaskConfig
 from segvisrl_jax.env.task import Track, judge
+from segvisrl_jax.training.loop import held_out_env
 from segvisrl_jax.types import Outcome, Scene
 
 TASK, RULES = TaskConfig(), SceneConfig()
@@ -78,6 +79,15 @@ def test_collision_within_half_a_metre_of_a_rock():
     assert int(verdict.last) == 2
     assert total(verdict) == pytest.approx(100 * 0.12 - 100, abs=1e-3)
     assert float(verdict.min_clearance_m) == pytest.approx(0.48, abs=1e-5)
+
+
+def test_a_margin_moves_the_collision_outwards_in_training_only():
+    places = jnp.array([(1.30, 0.0), (1.36, 0.0), (1.42, 0.0), (1.48, 0.0), (1.52, 0.0)])
+    world, env = scene(rocks=[(2.0, 0.0)]), EnvConfig(task=TaskConfig(collision_margin_m=0.1))
+    for task, last in ((env.task, 2), (held_out_env(env).task, 4)):  # within 0.6 m, within 0.5 m
+        verdict = judge(jnp.zeros(2), track(places), world, jnp.int32(1), task, RULES)
+        assert int(verdict.outcome) == Outcome.COLLISION
+        assert int(verdict.last) == last
 
 
 def test_fall_off_the_map():
