@@ -19,10 +19,10 @@ unexport JAX_PLATFORMS
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train eval baselines demo sweep bench test test-fast check format lock clean
+.PHONY: help setup train eval baselines demo sweep bench table test test-fast check format lock clean
 
 help: ## this list
-	@echo "usage: make TARGET [ARCH=cnn_lstm|cnn|cnn_lstm_raw|mlp] [PRESET=auto|cpu|gpu|paper|smoke] [STEPS=] [SEED=] [RUN=] [ARGS=]"
+	@echo "usage: make TARGET [ARCH=cnn_lstm|cnn|cnn_lstm_raw|mlp|mlp_rocks] [PRESET=auto|cpu|gpu|paper|smoke] [STEPS=] [SEED=] [RUN=] [ARGS=]"
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  \1\t\2/' | expand -t 14
 
 setup: $(READY) ## create .venv from the pinned lock (every other target does it by itself)
@@ -45,6 +45,9 @@ eval: $(READY) ## drive EPISODES held-out scenes with runs/RUN, or POLICY=name
 baselines: $(READY) ## the P controller and the random one on 10,000 scenes
 	@$(BIN)/segvisrl eval --controller p --episodes 10000 --seed $(SEED) $(ARGS)
 	@$(BIN)/segvisrl eval --controller random --episodes 10000 --seed $(SEED) $(ARGS)
+
+table: $(READY) ## the evaluations in docs/results side by side: docs/results_table.md
+	@$(BIN)/segvisrl table docs/results --output docs/results_table.md $(ARGS)
 
 demo: $(READY) ## a trained policy drives one scene: demo.mp4
 	@$(BIN)/segvisrl demo $(ARGS)

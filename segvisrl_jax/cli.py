@@ -16,6 +16,7 @@ from segvisrl_jax.config import ConfigError
 COMMANDS = {
     "train": "train a policy, evaluate it, draw its learning curve and a video",
     "eval": "drive held-out scenes with a run, a policy or a controller, and report shares with intervals",
+    "table": "compare evaluations on the same scenes: the results table, in markdown",
     "demo": "let a policy drive one scene and write a video",
     "sweep": "train over scales, architectures and seeds; a table and a plot",
     "bench": "measure physics, rendering and learning on this machine",

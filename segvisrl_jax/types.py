@@ -108,5 +108,5 @@ class ConvexSolids:
     radius_m: Float32[np.ndarray, "N"]  # largest horizontal distance of a vertex from the origin
 
 
-Observation = UInt8[Array, "*B H W 3"] | Float[Array, "*B 7"]
+Observation = UInt8[Array, "*B H W 3"] | Float[Array, "*B D"]
 Action = Float32[Array, "*B 2"]  # left and right wheel speed as a share of the maximum; clipped to [0, 1]

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float32, PRNGKeyArray, Shaped, UInt8, UInt32
 
-from segvisrl_jax.config import Arch, NetworkConfig, require
+from segvisrl_jax.config import ARCH_OBSERVATION, IMAGE_OBSERVATIONS, Arch, NetworkConfig, require
 
 Params = Any  # flax's nested dict of parameters
 Key = PRNGKeyArray | UInt32[Array, "2"]
@@ -46,6 +46,11 @@ class PolicyOutput:
 def has_memory(arch: Arch) -> bool:
     """Whether the architecture carries an LSTM."""
     return arch.startswith("cnn_lstm")
+
+
+def has_convolutions(arch: Arch) -> bool:
+    """Whether the architecture looks at images."""
+    return ARCH_OBSERVATION[arch] in IMAGE_OBSERVATIONS
 
 
 def max_pool(images: Float32[Array, "N H W C"]) -> Float32[Array, "N H2 W2 C"]:
@@ -243,7 +248,7 @@ class Network:
     @property
     def has_convolutions(self) -> bool:
         """Whether the network looks at images."""
-        return self.module.arch != "mlp"
+        return has_convolutions(self.module.arch)
 
     @property
     def observation_dtype(self) -> Any:
@@ -259,16 +264,16 @@ def make_network(arch: str, config: NetworkConfig, observation_shape: tuple[int,
     """
     archs = Arch.__args__  # type: ignore[attr-defined]
     require(arch in archs, "arch", arch, "one of " + ", ".join(archs))
-    rank, axes = (1, "(size,)") if arch == "mlp" else (3, "(rows, columns, channels)")
+    rank, axes = (3, "(rows, columns, channels)") if has_convolutions(cast(Arch, arch)) else (1, "(size,)")
     good = len(observation_shape) == rank and all(size >= 1 for size in observation_shape)
     require(good, "observation_shape", observation_shape, f"{axes} for arch {arch!r}")
     return Network(ActorCritic(cast(Arch, arch), config), tuple(observation_shape))
 
 
 def _make_body(arch: Arch, config: NetworkConfig) -> MLP | ImpalaCNN:
-    if arch == "mlp":
-        return MLP(config.mlp_sizes)
-    return ImpalaCNN(config.channels, config.blocks_per_stage, config.feature_size)
+    if has_convolutions(arch):
+        return ImpalaCNN(config.channels, config.blocks_per_stage, config.feature_size)
+    return MLP(config.mlp_sizes)
 
 
 def _dense(size: int, gain: float = HIDDEN_GAIN) -> nn.Dense:

@@ -15,6 +15,7 @@ import tyro
 
 from segvisrl_jax.cli import parse
 from segvisrl_jax.config import (
+    IMAGE_OBSERVATIONS,
     Arch,
     ConfigError,
     EngineName,
@@ -211,7 +212,7 @@ def _train(asked: BenchOptions):
     config = preset_config(asked.arch, asked.preset)
     decisions = config.ppo.decisions_per_update
     images = decisions * config.ppo.num_epochs
-    sees = config.env.obs != "state"
+    sees = config.env.obs in IMAGE_OBSERVATIONS
     for redraw in (False, True) if sees else (False,):
         trainer = Trainer(replace_fields(config, redraw_observations=redraw, kl_stop=0.0))
         state = trainer.start()

@@ -20,7 +20,7 @@ class DemoOptions:
     """A run's folder: its best policy drives."""
     policy: str | None = None
     """A policy's folder, or the name of a shipped one. Default: cnn_lstm."""
-    controller: Literal["p", "random"] | None = None
+    controller: Literal["p", "random", "planner"] | None = None
     scene: int = 0
     """Number of the scene."""
     num_rocks: int | None = None

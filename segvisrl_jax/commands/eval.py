@@ -1,8 +1,10 @@
 """``segvisrl eval``: held-out scenes, driven by a run's policy, a policy folder or a controller."""
 
 import json
+import shlex
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,8 +20,9 @@ class EvalOptions:
     """A run's folder: its best policy drives."""
     policy: str | None = None
     """A policy's folder, or the name of a shipped one."""
-    controller: Literal["p", "random"] | None = None
-    """p: the paper's proportional controller, which knows where the goal is; random: uniform wheel speeds."""
+    controller: Literal["p", "random", "planner"] | None = None
+    """p: the paper's proportional controller, which knows where the goal is; random: uniform wheel speeds; planner:
+    knows goal and rocks, and follows the shortest path around them."""
     episodes: int = 1000
     seed: int = 0
     """Names the test scenes."""
@@ -46,15 +49,22 @@ def run(options: Sequence[str]) -> int:
     result = evaluate(asked)
     print(f"{result['method']}: {report_line(result)}")
     if asked.json is not None:
-        asked.json.write_text(json.dumps(result, indent=2) + "\n")
+        asked.json.write_text(as_json(result))
     return 0
 
 
 def evaluate(asked: EvalOptions) -> dict[str, Any]:
-    """Drives and returns the result: outcome shares, intervals, path metrics, seed, the resolved configuration."""
+    """Drives and returns the result as JSON data.
+
+    Returns:
+        method, source (what was asked for), ``evaluation.summarize``'s shares and path metrics, seed (of the scenes),
+        what ``training_record`` knows, command (what repeats the evaluation), wall_clock_s (driving the scenes,
+        compilation included), versions, device, physics_engine and renderer (those that ran; None for a policy that
+        does not look), config (the resolved environment), per_episode (``evaluation.per_episode``).
+    """
     from segvisrl_jax.env.rover_env import RoverEnv
     from segvisrl_jax.env.wrappers import TEST_STREAM, scene_stream
-    from segvisrl_jax.training.evaluation import Evaluator, summarize
+    from segvisrl_jax.training.evaluation import Evaluator, per_episode, shortest_paths_m, summarize
     from segvisrl_jax.training.metrics import ProgressDisplay
 
     policy, params, config = load_driver(asked.run, asked.policy, asked.controller)
@@ -62,11 +72,71 @@ def evaluate(asked: EvalOptions) -> dict[str, Any]:
     env = RoverEnv(env_config)
     evaluator = Evaluator(env, policy, min(asked.slots, asked.episodes))
     stream = scene_stream(asked.seed, TEST_STREAM)
+    began = time.monotonic()
     with ProgressDisplay(asked.episodes, description=f"{policy.name}: test scenes") as display:
         finished = evaluator.run(params, stream, asked.episodes, lambda n: display.update(n, {}))
-    summary = summarize(finished, env)
-    source = asked.run or asked.policy or asked.controller
-    return {"method": policy.name, "source": str(source), **summary, "seed": asked.seed, "config": to_dict(env_config)}
+    wall_clock_s = time.monotonic() - began
+    shortest_m = shortest_paths_m(finished, env)
+    return {
+        "method": policy.name,
+        "source": str(asked.run or asked.policy or asked.controller),
+        **summarize(finished, env, shortest_m),
+        "seed": asked.seed,
+        **training_record(asked),
+        "command": command_line(asked),
+        "wall_clock_s": round(wall_clock_s, 2),
+        **machine_record(),
+        "physics_engine": env.backend,
+        "renderer": env.renderer.name if env.renderer and policy.observes else None,
+        "config": to_dict(env_config),
+        "per_episode": per_episode(finished, env, shortest_m),
+    }
+
+
+def training_record(asked: EvalOptions) -> dict[str, Any]:
+    """training_seed, training_config and policy_sha256 (of the parameters); None for a controller."""
+    if not (asked.run or asked.policy):
+        return {"training_seed": None, "training_config": None, "policy_sha256": None}
+    import hashlib
+
+    import jax
+
+    from segvisrl_jax.training.checkpoint import load_policy
+
+    config, params, _ = load_policy(policy_folder(asked.run, asked.policy))
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(params):  # in the order of their names
+        digest.update(leaf.tobytes())
+    settings = {name: value for name, value in to_dict(config).items() if name not in ("run", "runs_dir", "resume")}
+    return {"training_seed": config.seed, "training_config": settings, "policy_sha256": digest.hexdigest()}
+
+
+def command_line(asked: EvalOptions) -> str:
+    """The command that repeats an evaluation: scenes, and every option that is not the default, but for --json."""
+    words = ["segvisrl", "eval"]
+    for f in fields(asked):
+        value = getattr(asked, f.name)
+        if f.name in ("episodes", "seed") or (f.name != "json" and value != f.default):
+            words += ["--" + f.name.replace("_", "-"), str(value)]
+    return shlex.join(words)
+
+
+def machine_record() -> dict[str, Any]:
+    """Versions of what decides the numbers, and the device they were made on."""
+    from importlib.metadata import version
+
+    import jax
+
+    packages = ("jax", "mujoco", "segvisrl_jax")
+    return {"versions": {name: version(name) for name in packages}, "device": jax.devices()[0].device_kind}
+
+
+def as_json(result: dict[str, Any]) -> str:
+    """The result, indented, but each list of ``per_episode`` in one line: 41 bytes an episode."""
+    head = json.dumps({name: value for name, value in result.items() if name != "per_episode"}, indent=2)
+    lists = result["per_episode"].items()
+    lines = [f'    "{name}": {json.dumps(values, separators=(",", ":"))}' for name, values in lists]
+    return head.removesuffix("\n}") + ',\n  "per_episode": {\n' + ",\n".join(lines) + "\n  }\n}\n"
 
 
 def load_driver(run: Path | None, policy: str | None, controller: str | None) -> tuple[Any, Any, EnvConfig]:
@@ -85,18 +155,19 @@ def load_driver(run: Path | None, policy: str | None, controller: str | None) ->
         return CONTROLLERS[controller](), (), EnvConfig(obs="state")
 
     from segvisrl_jax.agent.networks import make_network
+    from segvisrl_jax.env.rover_env import observation_shape
     from segvisrl_jax.training.checkpoint import load_policy
 
     if run is not None and not (Path(run) / "policy" / "policy.json").is_file():
         raise ConfigError(f"--run = {str(run)!r}: should be a run's folder that holds a policy (policy/policy.json)")
-    config, params, _ = load_policy(Path(run) / "policy" if run else Path(str(policy)))
-    network = make_network(config.arch, config.network, observation_shape(config))
+    config, params, _ = load_policy(policy_folder(run, policy))
+    network = make_network(config.arch, config.network, observation_shape(config.env))
     return network_policy(network, config.arch), params, held_out(config)
 
 
-def observation_shape(config: TrainConfig) -> tuple[int, ...]:
-    """Shape of one observation, without building the environment."""
-    return (7,) if config.env.obs == "state" else (*config.env.camera.observation_size_px, 3)
+def policy_folder(run: Path | None, policy: str | None) -> Path:
+    """Where a run's policy is, or the folder or name of a policy."""
+    return Path(run) / "policy" if run else Path(str(policy))
 
 
 def held_out(config: TrainConfig) -> EnvConfig:
@@ -119,6 +190,8 @@ def report_line(result: dict[str, Any]) -> str:
     low, high = result["success_ci95"]
     shares = ", ".join(f"{name} {100 * result[name]:.1f} %" for name in ("collision", "fall", "timeout"))
     success = f"success {100 * result['success']:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
-    return f"{success}, {shares}, SPL {result['spl']:.3f}" + (
+    groups = (("goal in view", result["success_goal_in_view"]), ("out of view", result["success_goal_out_of_view"]))
+    by_view = "".join(f", {name} {100 * share:.1f} %" for name, share in groups if share is not None)
+    return f"{success}{by_view}, {shares}, SPL {result['spl']:.3f}" + (
         f", unstable {100 * result['unstable']:.2f} %" if result["unstable"] else ""
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from segvisrl_jax.cli import INTERRUPTED, parse
-from segvisrl_jax.config import ConfigError, TrainConfig, flatten, from_dict, preset_config, to_dict
+from segvisrl_jax.config import IMAGE_OBSERVATIONS, ConfigError, TrainConfig, flatten, from_dict, preset_config, to_dict
 
 TEST_EPISODES = 200  # driven after training, on scenes that neither training nor the choice of the policy saw
 
@@ -98,10 +98,10 @@ def differences_from_paper(config: TrainConfig) -> str:
 
 def observation_memory(config: TrainConfig) -> str:
     """One line: what the observations of a batch take, so that nobody finds out by running out."""
-    from segvisrl_jax.commands.eval import observation_shape
+    from segvisrl_jax.env.rover_env import observation_shape
 
-    shape = observation_shape(config)
-    size = math.prod(shape) * (4 if config.env.obs == "state" else 1)
+    shape = observation_shape(config.env)
+    size = math.prod(shape) * (1 if config.env.obs in IMAGE_OBSERVATIONS else 4)
     total = size * config.ppo.decisions_per_update / 1e6
     if config.ppo.redraw_observations:
         return f"  observations: {total:,.1f} MB a batch, drawn again when needed (not stored)"
@@ -115,12 +115,12 @@ def _short(value: Any) -> str:
 def _finish(config: TrainConfig, run_dir: Path) -> None:
     """Test scenes, learning curve, video, and what to type next."""
     from segvisrl_jax.commands import demo
-    from segvisrl_jax.commands.eval import EvalOptions, evaluate, report_line
+    from segvisrl_jax.commands.eval import EvalOptions, as_json, evaluate, report_line
     from segvisrl_jax.report.figures import learning_curve
 
     episodes = min(TEST_EPISODES, 25 * config.evaluation.episodes)
     result = evaluate(EvalOptions(run=run_dir, episodes=episodes, seed=config.seed, slots=config.evaluation.num_slots))
-    (run_dir / "eval.json").write_text(json.dumps(result, indent=2) + "\n")
+    (run_dir / "eval.json").write_text(as_json(result))
     learning_curve([run_dir], run_dir / "learning_curve.png")
     demo.record(demo.DemoOptions(run=run_dir, output=run_dir / "rollout.mp4"))
     print(f"\n{episodes} test scenes: {report_line(result)}")

@@ -7,12 +7,21 @@ Nothing here depends on JAX or MuJoCo.
 from segvisrl_jax.config.checks import ConfigError, require
 from segvisrl_jax.config.environment import CameraConfig, EnvConfig, PhysicsConfig, SceneConfig, TaskConfig
 from segvisrl_jax.config.learning import EvaluationConfig, NetworkConfig, PPOConfig, TrainConfig
-from segvisrl_jax.config.names import ARCH_OBSERVATION, Arch, EngineName, ObservationKind, PresetName, RendererName
+from segvisrl_jax.config.names import (
+    ARCH_OBSERVATION,
+    IMAGE_OBSERVATIONS,
+    Arch,
+    EngineName,
+    ObservationKind,
+    PresetName,
+    RendererName,
+)
 from segvisrl_jax.config.presets import preset_config
 from segvisrl_jax.config.tree import flatten, from_dict, replace_fields, to_dict
 
 __all__ = [
     "ARCH_OBSERVATION",
+    "IMAGE_OBSERVATIONS",
     "Arch",
     "CameraConfig",
     "ConfigError",

@@ -211,7 +211,8 @@ class EnvConfig:
     """One environment: what is seen, by which renderer, in which world."""
 
     obs: ObservationKind = "segmentation"
-    """segmentation: four classes, coloured and shrunk; rgb: colour, only shrunk; state: a vector, no camera."""
+    """segmentation: four classes, coloured and shrunk; rgb: colour, only shrunk; state: a vector, no camera;
+    state_and_rocks: a vector that holds the nearest rocks too."""
     renderer: RendererName = "auto"
     """scanline: in the compiled program; gl: MuJoCo's own renderer, behind a callback; warp: MuJoCo Warp's ray caster,
     a call out of the program, needs segvisrl_jax[warp]; auto: scanline where it can."""

@@ -20,7 +20,7 @@ class NetworkConfig:
     lstm_size: int = 256
     """Width of the LSTM."""
     mlp_sizes: tuple[int, ...] = (128, 128)
-    """Hidden layers of the mlp architecture."""
+    """Hidden layers of the architectures mlp and mlp_rocks."""
     bounded_mean: bool = True
     """The Gaussian's mean is squashed to the wheels' range [0, 1]; else it is free."""
     initial_std: float = 0.25
@@ -128,7 +128,8 @@ class TrainConfig:
     """One training run."""
 
     arch: Arch = "cnn_lstm"
-    """cnn_lstm, cnn: segmented images, with and without memory; cnn_lstm_raw: colour images; mlp: the true state."""
+    """cnn_lstm, cnn: segmented images, with and without memory; cnn_lstm_raw: colour images; mlp: the true state;
+    mlp_rocks: the true state and the nearest rocks."""
     preset: PresetName = "cpu"
     """Where the defaults came from."""
     seed: int = 0

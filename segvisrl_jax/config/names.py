@@ -2,8 +2,8 @@
 
 from typing import Literal
 
-Arch = Literal["cnn_lstm", "cnn", "cnn_lstm_raw", "mlp"]
-ObservationKind = Literal["segmentation", "rgb", "state"]
+Arch = Literal["cnn_lstm", "cnn", "cnn_lstm_raw", "mlp", "mlp_rocks"]
+ObservationKind = Literal["segmentation", "rgb", "state", "state_and_rocks"]
 RendererName = Literal["auto", "scanline", "gl", "warp"]
 EngineName = Literal["auto", "native", "mjx"]
 PresetName = Literal["paper", "cpu", "gpu", "smoke"]
@@ -13,5 +13,8 @@ ARCH_OBSERVATION: dict[str, ObservationKind] = {
     "cnn": "segmentation",
     "cnn_lstm_raw": "rgb",
     "mlp": "state",
+    "mlp_rocks": "state_and_rocks",
 }
 """What each architecture reads."""
+IMAGE_OBSERVATIONS: tuple[ObservationKind, ...] = ("segmentation", "rgb")
+"""Those that are images; the others are vectors."""

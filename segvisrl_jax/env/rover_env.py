@@ -11,7 +11,7 @@ import numpy as np
 from brax.envs.base import Env, State
 from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt8
 
-from segvisrl_jax.config import EngineName, EnvConfig, ObservationKind, RendererName, replace_fields
+from segvisrl_jax.config import IMAGE_OBSERVATIONS, EngineName, EnvConfig, ObservationKind, RendererName, replace_fields
 from segvisrl_jax.env import model, rocks, task
 from segvisrl_jax.env.physics import make_engine
 from segvisrl_jax.env.pose import camera_mount, camera_pose, in_rover_frame, up_z, yaw_rad
@@ -33,6 +33,11 @@ from segvisrl_jax.vision.renderer import InGraphRenderer, Renderer, make_rendere
 from segvisrl_jax.vision.resample import colour_and_resample, resample_taps, tap_plan
 
 TYPICAL_TURN_RATE_RAD_S = 0.5  # scales the turn rate in the state observation to about 1
+STATE_SIZE = 7
+NUM_NEAREST_ROCKS = 8  # that a vector holds: at 64 rocks on the map, those within 5 m
+ROCK_SIZE = 3  # forward, left, closeness
+ROCK_RANGE_M = 6.0  # rocks beyond are left out: half a minute's drive
+ROCK_SCALE_M = 4.0  # scales a rock's place to about 1
 
 
 class RoverEnv(Env):
@@ -43,6 +48,9 @@ class RoverEnv(Env):
         ``rgb``: (H, W, 3) uint8, colour, only shrunk.
         ``state``: (7,) float32: goal in the rover's frame over the largest goal distance (x, y), sine and cosine of
         the heading, forward and sideways speed over the top speed, turn rate over 0.5 rad/s.
+        ``state_and_rocks``: (31,) float32: ``state``, then for each of the 8 nearest rocks within 6 m, the nearest
+        first: its centre in the rover's frame over 4 m (x, y), and the collision radius over its distance, which is 1
+        where the episode ends. Zeros where there are fewer.
     Action: (2,) float32, left and right wheel speed as a share of the top speed, clipped to [0, 1]. No reverse.
     Reward: see ``env.task``; one decision a second, judged every 0.2 s.
     Termination: success, collision, fall, or physics that diverged. Truncation: the time limit.
@@ -65,7 +73,7 @@ class RoverEnv(Env):
         camera = config.camera
         self._plan = tap_plan(camera.height_px, camera.width_px, camera.scale)
         self.renderer = self._look = None
-        if config.obs != "state":
+        if config.obs in IMAGE_OBSERVATIONS:
             rows, self._row_taps = np.unique(self._plan.rows, return_inverse=True)
             columns, self._column_taps = np.unique(self._plan.columns, return_inverse=True)
             self.renderer = make_renderer(config, rows, columns)
@@ -76,12 +84,12 @@ class RoverEnv(Env):
     @property
     def observation_shape(self) -> tuple[int, ...]:
         """Shape of one observation."""
-        return (*self.config.camera.observation_size_px, 3) if self.renderer else (7,)
+        return observation_shape(self.config)
 
     @property
     def observation_size(self) -> Any:
         """brax's notion of it: the length of a vector, the shape of an image."""
-        return self.observation_shape if self.renderer else self.observation_shape[0]
+        return self.observation_shape if self._look else self.observation_shape[0]
 
     @property
     def action_size(self) -> int:
@@ -166,9 +174,10 @@ class RoverEnv(Env):
 
     def observe(self, state: RoverState) -> Observation:
         """What the agent sees now. Unbatched."""
-        if self._look is None:
-            return self._state_vector(state)
-        return self._look(state.scene, self.camera(state))
+        if self._look is not None:
+            return self._look(state.scene, self.camera(state))
+        vector = self._state_vector(state)
+        return jnp.append(vector, self._rock_vector(state)) if self.config.obs == "state_and_rocks" else vector
 
     def camera(self, state: RoverState) -> CameraPose:
         """Where the camera is and how it looks. Unbatched."""
@@ -208,6 +217,17 @@ class RoverEnv(Env):
         ]
         return jnp.concatenate(parts).astype(jnp.float32)
 
+    def _rock_vector(self, state: RoverState) -> Float32[Array, "D"]:
+        """The nearest rocks, 3 numbers each, zeros where there are fewer."""
+        offset = state.scene.rock_xy_m - state.physics.qpos[:2]
+        nearness, order = jax.lax.top_k(-jnp.linalg.norm(offset, axis=-1), min(NUM_NEAREST_ROCKS, len(offset)))
+        distance = -nearness[:, None]
+        place = jax.vmap(in_rover_frame, in_axes=(0, None))(offset[order], yaw_rad(state.physics.qpos))
+        limit = self.config.task.collision_radius_m
+        rocks = jnp.concatenate([place / ROCK_SCALE_M, limit / jnp.maximum(distance, limit)], axis=-1)
+        seen = jnp.where(distance <= ROCK_RANGE_M, rocks, 0.0)
+        return jnp.pad(seen.ravel(), (0, NUM_NEAREST_ROCKS * ROCK_SIZE - seen.size)).astype(jnp.float32)
+
     # MuJoCo's view of it
 
     @functools.cached_property
@@ -235,7 +255,7 @@ def make_env(
     """Builds an environment.
 
     Args:
-        obs: ``segmentation``, ``rgb`` or ``state``.
+        obs: ``segmentation``, ``rgb``, ``state`` or ``state_and_rocks``.
         scale: bicubic downsampling per axis.
         renderer: ``auto`` (``scanline``), ``scanline``, ``gl`` or ``warp``.
         physics: ``auto``, ``native`` or ``mjx``.
@@ -254,6 +274,14 @@ def make_env(
         "num_rocks": num_rocks,
     }
     return RoverEnv(replace_fields(EnvConfig(), **named, **fields))
+
+
+def observation_shape(config: EnvConfig) -> tuple[int, ...]:
+    """Shape of one observation, without building the environment."""
+    if config.obs in IMAGE_OBSERVATIONS:
+        return (*config.camera.observation_size_px, 3)
+    num_rocks = NUM_NEAREST_ROCKS if config.obs == "state_and_rocks" else 0
+    return (STATE_SIZE + num_rocks * ROCK_SIZE,)
 
 
 def _track(judged: PhysicsState) -> task.Track:

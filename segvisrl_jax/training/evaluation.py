@@ -47,6 +47,7 @@ class Finished:
     episode_return: np.ndarray
     goal_xy_m: np.ndarray
     rock_xy_m: np.ndarray
+    start_yaw_rad: np.ndarray
 
 
 @dataclasses.dataclass
@@ -135,6 +136,7 @@ def _ended(episode: Array, done: Array, rover: RoverState) -> dict[str, Array]:
         "episode_return": rover.episode_return,
         "goal_xy_m": rover.scene.goal_xy_m,
         "rock_xy_m": rover.scene.rock_xy_m,
+        "start_yaw_rad": rover.scene.start_yaw_rad,
     }
 
 
@@ -145,14 +147,21 @@ def _collect(ended: dict[str, np.ndarray], found: dict[int, dict[str, np.ndarray
         found[int(episodes[where])] = {name: values[where] for name, values in ended.items()}
 
 
-def summarize(finished: Finished, env: RoverEnv) -> dict[str, Any]:
+def summarize(finished: Finished, env: RoverEnv, shortest_m: np.ndarray | None = None) -> dict[str, Any]:
     """Shares of the outcomes with their intervals, and the quality of the paths.
+
+    Args:
+        finished: E episodes.
+        env: what they were driven in.
+        shortest_m: (E,) ``shortest_paths_m`` of the same episodes, where they are known already.
 
     Returns:
         success, collision, fall, timeout, unstable: shares that sum to 1, and their intervals (success_ci95 ...,
         Wilson). spl: Anderson et al. 2018, against the shortest collision-free path. path_ratio: driven over
         shortest, of successful episodes, as is mean_time_s. min_clearance_m: the least distance to a rock's centre
-        over all episodes (None without rocks). mean_return.
+        over all episodes (None without rocks). mean_return. Success apart for goals that are in the camera's
+        horizontal field of view at the start and for others: success_goal_in_view, success_goal_in_view_ci95,
+        episodes_goal_in_view, and the same with goal_out_of_view (None where there is no such episode).
     """
     episodes = len(finished.outcome)
     summary: dict[str, Any] = {"episodes": episodes}
@@ -164,7 +173,7 @@ def summarize(finished: Finished, env: RoverEnv) -> dict[str, Any]:
         if kind != Outcome.UNSTABLE:
             summary[f"{kind.name.lower()}_ci95"] = list(wilson_interval(count, episodes))
     succeeded = finished.outcome == Outcome.SUCCESS
-    shortest = shortest_paths_m(finished, env)
+    shortest = shortest_paths_m(finished, env) if shortest_m is None else shortest_m
     clearance = float(np.min(finished.min_clearance_m))
     time_s = finished.num_decisions[succeeded] * env.dt
     summary["spl"] = spl(succeeded, shortest, finished.path_length_m)
@@ -172,7 +181,49 @@ def summarize(finished: Finished, env: RoverEnv) -> dict[str, Any]:
     summary["mean_time_s"] = float(np.mean(time_s)) if succeeded.any() else None
     summary["min_clearance_m"] = clearance if np.isfinite(clearance) else None
     summary["mean_return"] = float(np.mean(finished.episode_return))
-    return summary
+    in_view = np.abs(goal_bearings_deg(finished, env)) <= env.config.camera.horizontal_fov_deg / 2
+    return (
+        summary | _success_of(succeeded[in_view], "goal_in_view") | _success_of(succeeded[~in_view], "goal_out_of_view")
+    )
+
+
+def _success_of(succeeded: np.ndarray, name: str) -> dict[str, Any]:
+    """Count, share and interval of one group of episodes."""
+    episodes, successes = len(succeeded), int(np.sum(succeeded))
+    return {
+        f"episodes_{name}": episodes,
+        f"success_{name}": successes / episodes if episodes else None,
+        f"success_{name}_ci95": list(wilson_interval(successes, episodes)) if episodes else None,
+    }
+
+
+def per_episode(finished: Finished, env: RoverEnv, shortest_m: np.ndarray) -> dict[str, list[Any]]:
+    """What became of every episode, as equally long lists of JSON data, for paired tests and splits.
+
+    Returns:
+        outcome: names. num_decisions. path_length_m, shortest_path_m and min_clearance_m, rounded to millimetres,
+        and goal_bearing_deg (at the start), rounded to 0.01 degrees; None where infinite, as the clearance is without
+        rocks, or where physics diverged.
+    """
+    return {
+        "outcome": [Outcome(kind).name.lower() for kind in finished.outcome],
+        "num_decisions": finished.num_decisions.tolist(),
+        "path_length_m": _rounded(finished.path_length_m, 3),
+        "shortest_path_m": _rounded(shortest_m, 3),
+        "min_clearance_m": _rounded(finished.min_clearance_m, 3),
+        "goal_bearing_deg": _rounded(goal_bearings_deg(finished, env), 2),
+    }
+
+
+def _rounded(values: np.ndarray, digits: int) -> list[float | None]:
+    return [round(value, digits) if np.isfinite(value) else None for value in values.tolist()]
+
+
+def goal_bearings_deg(finished: Finished, env: RoverEnv) -> np.ndarray:
+    """Angle of every episode's goal off the rover's first heading, to the left, in [-180, 180], (episodes,)."""
+    offset = finished.goal_xy_m - np.asarray(env.config.scene.start_xy_m)
+    angle = np.arctan2(offset[:, 1], offset[:, 0]) - finished.start_yaw_rad
+    return np.degrees(np.arctan2(np.sin(angle), np.cos(angle)))
 
 
 def shortest_paths_m(finished: Finished, env: RoverEnv) -> np.ndarray:

@@ -60,7 +60,15 @@ def random_controller() -> Policy:
     return Policy("random", observes=False, initial_carry=lambda num_envs: (), act=act)
 
 
-CONTROLLERS = {"p": p_controller, "random": random_controller}
+def planner() -> Policy:
+    """The privileged planner (``planner.planner``, which builds on this file: imported when asked for)."""
+    from segvisrl_jax.training import planner
+
+    return planner.planner()
+
+
+CONTROLLERS: dict[str, Callable[[], Policy]] = {"p": p_controller, "random": random_controller, "planner": planner}
+"""By the names that the command line takes."""
 
 
 def network_policy(network: Network, name: str) -> Policy:

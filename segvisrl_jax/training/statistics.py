@@ -3,6 +3,8 @@
 Plain NumPy and SciPy on counts and per-episode arrays; this file runs no episode.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import binomtest
@@ -31,6 +33,36 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
     require(0 < confidence < 1, "confidence", confidence, "between 0 and 1")
     interval = binomtest(successes, trials).proportion_ci(confidence, method="wilson")
     return float(interval.low), float(interval.high)
+
+
+class McNemar(NamedTuple):
+    """What a paired comparison of two methods found: the scenes that only one of them solved."""
+
+    only_first: int
+    only_second: int
+    p_value: float
+
+
+def mcnemar(first: Bool[np.ndarray, "E"], second: Bool[np.ndarray, "E"]) -> McNemar:
+    """McNemar's exact test of two methods' success on the same scenes.
+
+    Args:
+        first: whether the first method solved each scene.
+        second: whether the second method solved it; scene by scene the same ones.
+
+    Returns:
+        The numbers of discordant pairs (scenes that only the first, only the second solved), and the two-sided
+        p-value of ``mcnemar_p_value``.
+
+    Source: Q. McNemar, "Note on the sampling error of the difference between correlated proportions or
+    percentages", Psychometrika 12 (1947), with the binomial distribution in place of its chi-squared limit.
+
+    Raises:
+        ConfigError: where the two have not the same number of scenes.
+    """
+    require(len(first) == len(second), "second", len(second), f"as many scenes as first, {len(first)}")
+    only_first, only_second = int(np.sum(first & ~second)), int(np.sum(second & ~first))
+    return McNemar(only_first, only_second, mcnemar_p_value(only_first, only_second))
 
 
 def mcnemar_p_value(only_first: int, only_second: int) -> float:

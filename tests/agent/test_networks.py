@@ -13,13 +13,14 @@ from segvisrl_jax.config import ConfigError, NetworkConfig
 
 SMALL = NetworkConfig(channels=(4, 8), blocks_per_stage=1, feature_size=16, lstm_size=12)
 IMAGE = (9, 14, 3)
+VECTOR = {"mlp": (7,), "mlp_rocks": (31,)}
 T, B = 11, 3
 
 
 @functools.cache
 def built(arch: str) -> tuple[Network, dict]:
     """A small network and its parameters, which no test may change."""
-    network = make_network(arch, SMALL, (7,) if arch == "mlp" else IMAGE)
+    network = make_network(arch, SMALL, VECTOR.get(arch, IMAGE))
     return network, network.init(jax.random.key(0))
 
 
@@ -94,7 +95,7 @@ def test_initial_weights_are_orthogonal_with_the_usual_gains() -> None:
     np.testing.assert_allclose(kernel.T @ kernel, 2 * np.eye(kernel.shape[1]), atol=1e-5)
 
 
-@pytest.mark.parametrize("arch", ["cnn_lstm", "cnn", "mlp"])
+@pytest.mark.parametrize("arch", ["cnn_lstm", "cnn", "mlp", "mlp_rocks"])
 def test_stepping_equals_unrolling_across_resets(arch: str) -> None:
     network, params = built(arch)
     observation, reset, carry = observations(network, (T, B)), resets(), random_carry(network)
@@ -179,7 +180,7 @@ def test_deviation_stays_in_its_range() -> None:
     np.testing.assert_allclose(np.exp(output.log_std), [0.01, 10.0], rtol=1e-5)
 
 
-@pytest.mark.parametrize("arch", ["cnn", "mlp"])
+@pytest.mark.parametrize("arch", ["cnn", "mlp", "mlp_rocks"])
 def test_without_memory_the_carry_is_empty_and_resets_do_nothing(arch: str) -> None:
     network, params = built(arch)
     assert network.initial_carry((B,)) == ()
@@ -203,6 +204,7 @@ def test_raw_images_go_through_the_same_network() -> None:
     [
         ("lstm", IMAGE, "arch"),
         ("mlp", IMAGE, "observation_shape"),
+        ("mlp_rocks", IMAGE, "observation_shape"),
         ("cnn", (7,), "observation_shape"),
         ("cnn_lstm", (0, 14, 3), "observation_shape"),
     ],

@@ -68,7 +68,7 @@ def test_help_lists_the_commands_and_their_options(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arch", ["cnn_lstm", "cnn", "cnn_lstm_raw", "mlp"])
+@pytest.mark.parametrize("arch", ["cnn_lstm", "cnn", "cnn_lstm_raw", "mlp", "mlp_rocks"])
 def test_train_eval_demo_as_a_user_does(arch, tmp_path):
     trained = segvisrl("train", "--arch", arch, *SMOKE, cwd=tmp_path)
     assert trained.returncode == 0, trained.stderr

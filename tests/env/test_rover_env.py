@@ -11,8 +11,9 @@ import pytest
 from brax.envs.base import Env, State
 
 import segvisrl_jax
-from segvisrl_jax.config import ConfigError
+from segvisrl_jax.config import IMAGE_OBSERVATIONS, ConfigError
 from segvisrl_jax.env.pose import camera_mount, camera_pose
+from segvisrl_jax.env.rover_env import observation_shape
 from segvisrl_jax.env.wrappers import BatchEnv
 from segvisrl_jax.types import Outcome
 from segvisrl_jax.vision.classes import PALETTE
@@ -125,6 +126,64 @@ def test_state_observation_says_where_the_goal_is():
     np.testing.assert_allclose(left[:2] * 16.0, [offset[1], -offset[0]], atol=1e-4)
 
 
+def rover_among(env, rock_xy_m, xy_m=(1.0, 2.0), yaw_rad=np.pi / 2):
+    """A rover at a place, among these rocks; the goal is the origin."""
+    rover = jax.jit(env.initial_state)(jax.random.key(6))
+    rocks = jnp.array(rock_xy_m, jnp.float32).reshape(-1, 2)
+    scene = rover.scene.replace(goal_xy_m=jnp.zeros(2), rock_xy_m=rocks)
+    return rover.replace(physics=env.engine.place(jnp.array(xy_m), jnp.float32(yaw_rad)), scene=scene)
+
+
+def seen_rocks(env, rover):
+    vector = np.asarray(jax.jit(env.observe)(rover))
+    assert vector.shape == env.observation_shape == (env.observation_size,) == (31,)
+    assert vector.dtype == np.float32
+    return vector[7:].reshape(8, 3)
+
+
+def test_rock_observation_by_hand():
+    env = make("state_and_rocks")
+    assert env.renderer is None
+    # from (1, 2), facing along y: 2 m ahead, 4 m to the left, 5 m behind and to the right, and 6.01 m away: too far
+    rover = rover_among(env, [[-3, 2], [1, -4.01], [1, 4], [4, -2]])
+    expected = [[0.5, 0.0, 0.25], [0.0, 1.0, 0.125], [-1.0, -0.75, 0.1]]
+    seen = seen_rocks(env, rover)
+    np.testing.assert_allclose(seen[:3], expected, atol=1e-6)
+    assert np.all(seen[3:] == 0)
+    state = np.asarray(jax.jit(make("state").observe)(rover))
+    np.testing.assert_array_equal(np.asarray(jax.jit(env.observe)(rover))[:7], state)
+    np.testing.assert_allclose(state[:2] * 16, [-2, 1], atol=1e-6)
+
+
+def test_rock_observation_holds_the_nearest_in_any_order_and_never_exceeds_one():
+    env = make("state_and_rocks", num_rocks=12)
+    distance = 0.3 + 0.45 * np.arange(12)  # the first is within the collision radius
+    angle = 2.4 * np.arange(12)
+    rocks = np.array([1.0, 2.0]) + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    seen = seen_rocks(env, rover_among(env, rocks))
+    np.testing.assert_allclose(np.linalg.norm(seen[:, :2], axis=1) * 4, distance[:8], atol=1e-5)
+    np.testing.assert_allclose(seen[:, 2], np.minimum(1, 0.5 / distance[:8]), atol=1e-5)
+    shuffled = np.random.default_rng(0).permutation(rocks)
+    assert not np.array_equal(shuffled[:8], rocks[:8])
+    np.testing.assert_array_equal(seen_rocks(env, rover_among(env, shuffled)), seen)
+
+
+@pytest.mark.parametrize("num_rocks", [0, 3])
+def test_rock_observation_is_padded_with_zeros(num_rocks):
+    env = make("state_and_rocks", num_rocks=num_rocks)
+    seen = seen_rocks(env, rover_among(env, [[1 + i, 3] for i in range(num_rocks)]))
+    assert np.all(seen[:num_rocks, 2] > 0)
+    assert np.all(seen[num_rocks:] == 0)
+
+
+@pytest.mark.parametrize("obs", ["segmentation", "rgb", "state", "state_and_rocks"])
+def test_the_shape_is_known_without_building_the_environment(obs):
+    env = make(obs)
+    seen = jax.eval_shape(env.observe, jax.eval_shape(env.initial_state, jax.random.key(0)))
+    assert observation_shape(env.config) == env.observation_shape == seen.shape
+    assert seen.dtype == (jnp.uint8 if obs in IMAGE_OBSERVATIONS else jnp.float32)
+
+
 def test_diverged_physics_never_reaches_the_observation():
     env = make("state")
     rover = jax.jit(env.initial_state)(jax.random.key(7))
@@ -170,7 +229,7 @@ def test_same_key_same_episode():
 @pytest.mark.parametrize(
     ("fields", "says"),
     [
-        ({"obs": "sonar"}, "env.obs = 'sonar'.*segmentation, rgb, state"),
+        ({"obs": "sonar"}, "env.obs = 'sonar'.*segmentation, rgb, state, state_and_rocks"),
         ({"physics": "bullet"}, "engine = 'bullet'.*native"),
         ({"renderer": "crayon"}, "renderer = 'crayon'.*scanline"),
         ({"scale": -3}, "scale = -3.*1 or more"),

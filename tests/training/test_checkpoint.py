@@ -76,7 +76,7 @@ def test_an_unknown_policy_is_answered_with_those_there_are():
         load_policy("no_such_policy")
 
 
-@pytest.mark.parametrize("arch", ["cnn_lstm", "cnn", "cnn_lstm_raw", "mlp"])
+@pytest.mark.parametrize("arch", ["cnn_lstm", "cnn", "cnn_lstm_raw", "mlp", "mlp_rocks"])
 @pytest.mark.parametrize("preset", ["paper", "cpu", "gpu", "smoke"])
 def test_settings_survive_json(arch, preset):
     config = preset_config(arch, preset)

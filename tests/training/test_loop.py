@@ -140,6 +140,18 @@ def test_evaluation_starts_as_the_paper_does_whatever_training_does():
     assert loop.held_out_env(config.env).scene.random_start_yaw_share == 0
 
 
+def test_the_nearest_rocks_are_learnt_from():
+    """One update of the smoke preset: every weight moves, those behind the rocks' numbers too."""
+    trainer = loop.Trainer(replace_fields(preset_config("mlp_rocks", "smoke"), engine="native"))
+    before = trainer.start()
+    after, metrics, _ = trainer.update(before)
+    assert all(np.isfinite(value) for value in jax.device_get(metrics).values())
+    first_layers = [state.learner.params["params"]["body"]["Dense_0"]["kernel"] for state in (before, after)]
+    moved = np.any(np.asarray(first_layers[0]) != np.asarray(first_layers[1]), axis=1)
+    assert moved.shape == (31,)
+    assert moved[:10].all()  # the state and the nearest rock; there are 4 rocks, and not all are ever near
+
+
 @pytest.mark.gl
 @pytest.mark.slow
 def test_trains_through_mujocos_renderer_too():

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from segvisrl_jax.config import ConfigError
-from segvisrl_jax.training.statistics import mcnemar_p_value, path_ratio, spl, wilson_interval
+from segvisrl_jax.training.statistics import mcnemar, mcnemar_p_value, path_ratio, spl, wilson_interval
 
 COUNTS = st.integers(1, 3000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
 LENGTHS = st.lists(st.tuples(st.booleans(), st.floats(0.1, 50), st.floats(0.0, 99)), min_size=1)
@@ -60,6 +60,20 @@ def test_wilson_interval_refuses(arguments):
 )
 def test_mcnemar_by_hand(only_first, only_second, expected):
     assert mcnemar_p_value(only_first, only_second) == pytest.approx(expected)
+
+
+def test_mcnemar_counts_the_scenes_that_one_solved_and_the_other_not():
+    both, only_first, only_second, neither = [1, 1], [1, 0], [0, 1], [0, 0]
+    scenes = [both] * 7 + [only_first] * 10 + [only_second] * 2 + [neither] * 4
+    first, second = np.array(scenes, bool).T
+    assert mcnemar(first, second) == (10, 2, pytest.approx(2 * (1 + 12 + 66) / 2**12))
+    assert mcnemar(second, first) == (2, 10, pytest.approx(2 * (1 + 12 + 66) / 2**12))
+    assert mcnemar(first, first) == (0, 0, 1.0)
+
+
+def test_mcnemar_refuses_other_numbers_of_scenes():
+    with pytest.raises(ConfigError, match="second = 2: should be as many scenes as first, 3"):
+        mcnemar(np.ones(3, bool), np.ones(2, bool))
 
 
 @given(st.integers(0, 300), st.integers(0, 300))
