@@ -16,18 +16,17 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float32, PRNGKeyArray, Shaped, UInt8, UInt32
 
+from segvisrl_jax.agent.convolution import WINDOW, flax_convolution, max_pool
+from segvisrl_jax.agent.memory import Carry, ResettableLSTM
 from segvisrl_jax.config import ARCH_OBSERVATION, IMAGE_OBSERVATIONS, Arch, NetworkConfig, require
 
 Params = Any  # flax's nested dict of parameters
 Key = PRNGKeyArray | UInt32[Array, "2"]
-Carry = tuple[Float32[Array, "..."], ...]
-"""The LSTM's (cell, hidden) state, each (*B, lstm_size); empty for a network without memory."""
 
 ACTION_SIZE = 2  # left and right wheel
 MIDDLE_SPEED = 0.5  # the policy starts at half speed, in the middle of the action's range [0, 1]
 HALF_RANGE = 0.5  # half the width of that range
 PIXEL_MAX = 255.0
-POOL_WINDOW, POOL_STRIDE = 3, 2  # Impala's max-pool (Espeholt et al., 2018)
 # Gains of the orthogonal initialisers: those usual for PPO. Inside residual blocks sqrt(2) would
 # multiply the features tenfold (root mean square 21 against 1.9) and saturate the LSTM's gates.
 HIDDEN_GAIN, RESIDUAL_GAIN, POLICY_GAIN, VALUE_GAIN = math.sqrt(2.0), 0.7, 0.01, 1.0
@@ -51,26 +50,6 @@ def has_memory(arch: Arch) -> bool:
 def has_convolutions(arch: Arch) -> bool:
     """Whether the architecture looks at images."""
     return ARCH_OBSERVATION[arch] in IMAGE_OBSERVATIONS
-
-
-def max_pool(images: Float32[Array, "N H W C"]) -> Float32[Array, "N H2 W2 C"]:
-    """3 x 3 max-pool with stride 2 and SAME padding, as elementwise maxima of strided slices.
-
-    Equal to ``flax.linen.max_pool``; its gradient is faster on a CPU, and shared where pixels tie.
-    """
-    return _pool_axis(_pool_axis(images, axis=2), axis=1)
-
-
-def _pool_axis(images: Float32[Array, "N H W C"], axis: int) -> Float32[Array, "N H2 W2 C"]:
-    size = images.shape[axis]
-    last = POOL_STRIDE * ((size - 1) // POOL_STRIDE)  # where the last window starts
-    padding = max(last + POOL_WINDOW - size, 0)
-    widths = [(0, 0)] * images.ndim
-    widths[axis] = (padding // 2, padding - padding // 2)
-    padded = jnp.pad(images, widths, constant_values=-jnp.inf)
-    shifts = range(POOL_WINDOW)
-    slices = [jax.lax.slice_in_dim(padded, k, k + last + 1, POOL_STRIDE, axis) for k in shifts]
-    return jnp.maximum(jnp.maximum(slices[0], slices[1]), slices[2])
 
 
 class ResidualBlock(nn.Module):
@@ -117,36 +96,6 @@ class MLP(nn.Module):
         for size in self.sizes:
             vector = nn.relu(_dense(size)(vector))
         return vector
-
-
-class ResettableLSTM(nn.Module):
-    """An LSTM whose carry is zeroed where an episode begins, before the cell sees it."""
-
-    size: int
-
-    def setup(self) -> None:
-        """Builds the cell (flax's own)."""
-        self.cell = nn.OptimizedLSTMCell(self.size, kernel_init=nn.initializers.orthogonal())
-
-    def __call__(
-        self, carry: Carry, features: Float32[Array, "B F"], reset: Float32[Array, " B"]
-    ) -> tuple[Carry, Float32[Array, "B S"]]:
-        """One step for every environment."""
-        begins = reset[:, None] > 0
-        cell, hidden = jax.tree.map(lambda part: jnp.where(begins, 0.0, part), carry)
-        return self.cell((cell, hidden), features)
-
-    def unroll(
-        self, carry: Carry, features: Float32[Array, "T B F"], reset: Float32[Array, "T B"]
-    ) -> tuple[Carry, Float32[Array, "T B S"]]:
-        """All steps in time order."""
-        scan = nn.scan(_lstm_step, variable_broadcast="params", split_rngs={"params": False})
-        return scan(self, carry, (features, reset))
-
-
-def _lstm_step(lstm: ResettableLSTM, carry: Carry, inputs: tuple) -> tuple[Carry, Array]:
-    features, reset = inputs
-    return lstm(carry, features, reset)
 
 
 class ActorCritic(nn.Module):
@@ -281,5 +230,5 @@ def _dense(size: int, gain: float = HIDDEN_GAIN) -> nn.Dense:
 
 
 def _convolution(channels: int, gain: float = HIDDEN_GAIN) -> nn.Conv:
-    window = (3, 3)  # Impala's
-    return nn.Conv(channels, window, kernel_init=nn.initializers.orthogonal(gain))
+    start = nn.initializers.orthogonal(gain)
+    return nn.Conv(channels, WINDOW, kernel_init=start, conv_general_dilated=flax_convolution)

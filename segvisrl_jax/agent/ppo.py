@@ -2,12 +2,15 @@
 
 One ``Learner``, two ways to run it, one result. ``fused``: the whole update is one compiled
 program, for accelerators. ``host``: Python drives the minibatches, since XLA on a CPU runs
-convolution gradients inside a loop many times slower than outside it. The loss is in loss.py;
-acting is not here (training/rollout.py).
+convolution gradients inside a loop many times slower than outside it; every core takes chunks of
+whole environments, which is faster than all cores at one convolution, and their gradients are added in a
+fixed order. The loss is in loss.py; acting is not here (training/rollout.py).
 """
 
 import dataclasses
 import functools
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal, cast
 
@@ -36,6 +39,9 @@ Metrics = dict[str, Float32[Array, ""]]
 Total = tuple[Params, LossTerms]  # sums of gradient and loss terms over chunks
 
 ADAM_EPSILON = 1e-5  # usual for PPO (Huang et al., 2022, "The 37 implementation details")
+# The rate is multiplied or divided by KL_FACTOR where an update's KL divergence is KL_TOLERANCE times too small or too
+# large: Schulman et al. (2017, section 4) adapt a penalty so; here it is the rate, in smaller and more frequent steps.
+KL_TOLERANCE, KL_FACTOR = 1.5, 1.25
 # A gradient is summed over chunks of whole environments of at most this many pixels (at least one
 # environment). CPU: 64 images of 48 x 27, which measured fastest (cache). Accelerators: about 8 GB
 # of activations, at some 500 bytes a pixel.
@@ -48,6 +54,7 @@ class LearnerState:
 
     params: Params
     opt_state: optax.OptState
+    rate_share: Float32[Array, ""]  # of the scheduled learning rate; below 1 while updates move the policy too far
     num_updates: Int32[Array, ""]
     num_gradient_steps: Int32[Array, ""]  # applied, not skipped
 
@@ -66,10 +73,9 @@ class Progress:
 
 
 def learning_rate_schedule(config: PPOConfig, total_updates: int) -> optax.Schedule:
-    """Linear over the gradient steps of ``total_updates`` full updates."""
-    num_steps = total_updates * config.num_epochs * config.num_minibatches
+    """Linear over ``total_updates`` updates; the last one has the final rate."""
     final = config.learning_rate * config.final_learning_rate_share
-    return optax.linear_schedule(config.learning_rate, final, num_steps)
+    return optax.linear_schedule(config.learning_rate, final, max(1, total_updates - 1))
 
 
 def default_chunk(network: Network, config: PPOConfig, on_cpu: bool) -> int:
@@ -102,7 +108,7 @@ class Learner:
         """Fresh parameters and optimiser state."""
         params = self.network.init(key)
         opt_state = self.optimizer.init(params)
-        return LearnerState(params, opt_state, _zero(jnp.int32), _zero(jnp.int32))
+        return LearnerState(params, opt_state, jnp.ones(()), _zero(jnp.int32), _zero(jnp.int32))
 
     def update(
         self,
@@ -154,17 +160,20 @@ class Learner:
         self, state: LearnerState, trajectory: Trajectory, last_value: Array, key: Key
     ) -> tuple[LearnerState, Metrics]:
         batch, minibatches, explained_variance = self._prepare(trajectory, last_value, key)
-        progress, zero = _start_progress(state), _zero_total(state.params)
-        for epoch in np.asarray(minibatches):
-            for envs in epoch:
-                total = zero
-                for piece in envs.reshape(-1, self.chunk):
-                    total = self._add_chunk(total, progress.state.params, batch, piece)
-                progress = self._apply(progress, total)
-            progress = _end_epoch(progress)
-            if self.config.kl_stop > 0 and not self._goes_on(progress):
-                break
+        progress = _start_progress(state)
+        with ThreadPoolExecutor(num_cores(), "segvisrl-gradient") as pool:
+            for epoch in np.asarray(minibatches):
+                for envs in epoch:
+                    gradient_of = functools.partial(self._finished_chunk, progress.state.params, batch)
+                    totals = tuple(pool.map(gradient_of, envs.reshape(-1, self.chunk)))
+                    progress = self._apply(progress, totals)
+                progress = _end_epoch(progress)
+                if self.config.kl_stop > 0 and not self._goes_on(progress):
+                    break
         return self._finish(progress, explained_variance)
+
+    def _finished_chunk(self, params: Params, batch: Batch, envs: Int32[np.ndarray, " chunk"]) -> Total:
+        return jax.block_until_ready(self._chunk_total(params, batch, envs))
 
     @functools.partial(jax.jit, static_argnums=0)
     def _prepare(
@@ -182,29 +191,32 @@ class Learner:
         params = progress.state.params
 
         def add(total: Total, piece: Int32[Array, " chunk"]) -> tuple[Total, None]:
-            return self._add_chunk(total, params, batch, piece), None
+            return jax.tree.map(jnp.add, total, self._chunk_total(params, batch, piece)), None
 
         pieces = envs.reshape((-1, self.chunk))
         total, _ = jax.lax.scan(add, _zero_total(params), pieces, unroll=len(pieces) == 1)
-        return self._apply(progress, total), None
+        return self._apply(progress, (total,)), None
 
     @functools.partial(jax.jit, static_argnums=0)
-    def _add_chunk(self, total: Total, params: Params, batch: Batch, envs: Int32[Array, " chunk"]) -> Total:
-        """Adds the gradient and the loss terms of a few environments."""
+    def _chunk_total(self, params: Params, batch: Batch, envs: Int32[Array, " chunk"]) -> Total:
+        """The gradient and the loss terms of a few environments."""
         gradient_of = jax.value_and_grad(ppo_loss, has_aux=True)
         part = take_environments(batch, envs)
         (_, terms), gradient = gradient_of(params, part, self.network, self.config, self.draw)
-        return jax.tree.map(jnp.add, total, (gradient, terms))
+        return gradient, terms
 
     @functools.partial(jax.jit, static_argnums=0)
-    def _apply(self, progress: Progress, total: Total) -> Progress:
+    def _apply(self, progress: Progress, totals: tuple[Total, ...]) -> Progress:
         """One step of the optimiser with the mean over a minibatch's chunks, if it is finite."""
+        total = jax.tree.map(lambda *parts: functools.reduce(jnp.add, parts), *totals)
         num_chunks = self.config.num_envs // self.config.num_minibatches // self.chunk
         gradient, terms = jax.tree.map(lambda leaf: leaf / num_chunks, total)
         state = progress.state
         norm = optax.tree.norm(gradient)
         with jax.numpy_dtype_promotion("standard"):  # optax multiplies whole numbers by floats
-            updates, opt_state = self.optimizer.update(gradient, state.opt_state, state.params)
+            directions, opt_state = self.optimizer.update(gradient, state.opt_state, state.params)
+        rate = self._learning_rate(state)
+        updates = jax.tree.map(lambda direction: -rate * direction, directions)
         stepped = Progress(
             state=dataclasses.replace(
                 state,
@@ -223,6 +235,18 @@ class Learner:
         finite = jnp.isfinite(norm) & jnp.isfinite(terms.loss)
         return jax.tree.map(functools.partial(jnp.where, finite), stepped, skipped)
 
+    def _learning_rate(self, state: LearnerState) -> Float32[Array, ""]:
+        """Of all steps of the next update."""
+        with jax.numpy_dtype_promotion("standard"):  # optax divides whole numbers
+            return jnp.asarray(self.schedule(state.num_updates), jnp.float32) * state.rate_share
+
+    def _next_rate_share(self, share: Float32[Array, ""], kl: Float32[Array, ""]) -> Float32[Array, ""]:
+        target = self.config.kl_target
+        if target == 0:
+            return share
+        lower = jnp.where(kl > KL_TOLERANCE * target, share / KL_FACTOR, share)
+        return jnp.where(kl < target / KL_TOLERANCE, jnp.minimum(share * KL_FACTOR, 1.0), lower)
+
     def _goes_on(self, progress: Progress) -> Array:
         """Whether another epoch follows."""
         more = progress.num_epochs_done < self.config.num_epochs
@@ -232,17 +256,20 @@ class Learner:
 
     @functools.partial(jax.jit, static_argnums=0)
     def _finish(self, progress: Progress, explained_variance: Float32[Array, ""]) -> tuple[LearnerState, Metrics]:
-        state = dataclasses.replace(progress.state, num_updates=progress.state.num_updates + 1)
+        before = progress.state
+        state = dataclasses.replace(
+            before,
+            rate_share=self._next_rate_share(before.rate_share, progress.last_kl),
+            num_updates=before.num_updates + 1,
+        )
         count = jnp.maximum(progress.num_applied, 1).astype(jnp.float32)
         means = jax.tree.map(lambda leaf: leaf / count, progress.terms_sum)
-        with jax.numpy_dtype_promotion("standard"):  # optax divides whole numbers
-            learning_rate = jnp.asarray(self.schedule(state.num_gradient_steps), jnp.float32)
         metrics = {field.name: getattr(means, field.name) for field in dataclasses.fields(means)}
         metrics |= {
             "approx_kl": progress.last_kl,
             "explained_variance": explained_variance,
             "gradient_norm": progress.gradient_norm_sum / count,
-            "learning_rate": learning_rate,
+            "learning_rate": self._learning_rate(before),
             "num_epochs_done": progress.num_epochs_done.astype(jnp.float32),
             "skipped_steps": progress.num_skipped.astype(jnp.float32),
         }
@@ -287,9 +314,14 @@ def make_learner(
     schedule = learning_rate_schedule(config, total_updates)
     optimizer = optax.chain(
         optax.clip_by_global_norm(config.max_gradient_norm),
-        optax.adam(schedule, eps=ADAM_EPSILON),
+        optax.scale_by_adam(eps=ADAM_EPSILON),
     )
     return Learner(network, config, schedule, optimizer, kind, chunk, draw)
+
+
+def num_cores() -> int:
+    """CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _start_progress(state: LearnerState) -> Progress:

@@ -73,6 +73,8 @@ class PPOConfig:
     """Advantages of a batch are shifted and scaled to mean 0, deviation 1."""
     kl_stop: float = 0.03
     """A batch's epochs end early once the policy moved this far (approximate KL); 0 never stops."""
+    kl_target: float = 0.0
+    """The rate falls below its line while updates move the policy farther than this, and comes back; 0 never."""
     redraw_observations: bool = False
     """Keep scenes and poses in place of images and draw these again in every epoch: less memory, more rendering."""
     bootstrap_on_timeout: bool = False
@@ -99,7 +101,7 @@ class PPOConfig:
         require(0 < self.clip_epsilon < 10, f"{p}.clip_epsilon", self.clip_epsilon, "in (0, 10)")
         require(self.max_gradient_norm > 0, f"{p}.max_gradient_norm", self.max_gradient_norm, "positive")
         require(self.reward_scale > 0, f"{p}.reward_scale", self.reward_scale, "positive")
-        for name in ("entropy_cost", "value_cost", "kl_stop"):
+        for name in ("entropy_cost", "value_cost", "kl_stop", "kl_target"):
             value = getattr(self, name)
             require(value >= 0, f"{p}.{name}", value, "0 or more")
 
@@ -141,6 +143,8 @@ class TrainConfig:
     """Where run folders go."""
     resume: bool = False
     """Go on from the run folder's last checkpoint."""
+    start_from: str = ""
+    """A policy's folder, or a shipped policy's name: training starts from its weights. Empty: from random ones."""
     checkpoint_every_updates: int = 8
     env: EnvConfig = field(default_factory=EnvConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)

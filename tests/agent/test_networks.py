@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from segvisrl_jax.agent.networks import ImpalaCNN, Network, ResettableLSTM, make_network, max_pool
+from segvisrl_jax.agent.convolution import flax_convolution, max_pool
+from segvisrl_jax.agent.memory import ResettableLSTM
+from segvisrl_jax.agent.networks import ImpalaCNN, Network, make_network
 from segvisrl_jax.config import ConfigError, NetworkConfig
 
 SMALL = NetworkConfig(channels=(4, 8), blocks_per_stage=1, feature_size=16, lstm_size=12)
@@ -46,6 +48,33 @@ def resets(seed: int = 1) -> jax.Array:
     drawn = np.random.default_rng(seed).random((T, B)) < 0.25
     assert drawn[1:-1].any()
     return jnp.asarray(drawn, jnp.float32)
+
+
+@pytest.mark.parametrize("size", [(6, 8), (7, 12), (4, 9)], ids=["even", "odd rows", "odd columns"])
+@pytest.mark.parametrize("channels", [(3, 16), (16, 16), (16, 32)], ids=["image", "narrow", "wide"])
+def test_convolution_is_that_of_flax_in_value_and_gradient(size: tuple[int, int], channels: tuple[int, int]) -> None:
+    rng = np.random.default_rng(0)
+    images = jnp.asarray(rng.normal(size=(2, *size, channels[0])), jnp.float32)
+    weights = jnp.asarray(rng.normal(size=(2, *size, channels[1])), jnp.float32)
+    theirs = nn.Conv(channels[1], (3, 3))
+    ours = theirs.clone(conv_general_dilated=flax_convolution)
+    params = theirs.init(jax.random.key(0), images)
+
+    def total(layer, params, images):
+        return jnp.sum(jnp.square(layer.apply(params, images)) * weights)
+
+    results = [
+        jax.jit(jax.value_and_grad(functools.partial(total, layer), argnums=(0, 1)))(params, images)
+        for layer in (ours, theirs)
+    ]
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-3), *results)
+
+
+@pytest.mark.parametrize("options", [{"strides": 2}, {"padding": "VALID"}, {"kernel_size": (5, 5)}])
+def test_convolution_refuses_what_it_does_not_compute(options: dict) -> None:
+    layer = nn.Conv(4, **({"kernel_size": (3, 3)} | options), conv_general_dilated=flax_convolution)
+    with pytest.raises(ValueError, match="not 3 x 3, stride 1, SAME"):
+        layer.init(jax.random.key(0), jnp.zeros((1, 8, 8, 3)))
 
 
 @pytest.mark.parametrize("size", [(8, 12), (9, 13), (27, 48), (1, 2), (1, 1)])
@@ -150,6 +179,35 @@ def test_lstm_is_flax_s_where_nothing_resets() -> None:
     for t in range(T):
         carry, hidden = apply_cell({"params": params["params"]["cell"]}, carry, features[t])
         np.testing.assert_allclose(outputs[t], hidden, atol=1e-6)
+
+
+def test_unrolling_the_lstm_is_flax_s_scan_in_value_and_gradient() -> None:
+    lstm, rng = ResettableLSTM(12), np.random.default_rng(1)
+    features = jnp.asarray(rng.normal(size=(T, B, 5)), jnp.float32)
+    reset = jnp.asarray(rng.random((T, B)) < 0.3, jnp.float32)
+    weights = jnp.asarray(rng.normal(size=(T, B, 12)), jnp.float32)
+    first = tuple(jnp.asarray(rng.normal(size=(B, 12)), jnp.float32) for _ in range(2))
+    params = lstm.init(jax.random.key(0), first, features[0], reset[0])
+
+    def by_steps(params, carry, features):
+        def one(carry, inputs):
+            return lstm.apply(params, carry, *inputs)
+
+        return jax.lax.scan(one, carry, (features, reset))
+
+    def unrolled(params, carry, features):
+        return lstm.apply(params, carry, features, reset, method="unroll")
+
+    def total(run, *args):
+        (cell, hidden), outputs = run(*args)
+        return jnp.sum(outputs * weights) + jnp.sum(cell * weights[0]) + jnp.sum(hidden * weights[1])
+
+    results = [
+        jax.jit(jax.value_and_grad(functools.partial(total, run), argnums=(0, 1, 2)))(params, first, features)
+        for run in (unrolled, by_steps)
+    ]
+    assert reset.any()
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5), *results)
 
 
 def test_policy_starts_at_half_speed_with_the_set_deviation() -> None:

@@ -225,14 +225,37 @@ def test_counts_and_learning_rate() -> None:
     assert int(new_state.num_gradient_steps) == 6
     assert metrics["num_epochs_done"] == 3
     assert metrics["skipped_steps"] == 0
-    share_done = 6 / (TOTAL_UPDATES * 3 * 2)
-    expected = CONFIG.learning_rate * (1 - share_done * (1 - CONFIG.final_learning_rate_share))
-    np.testing.assert_allclose(metrics["learning_rate"], expected, rtol=1e-5)
+    np.testing.assert_allclose(metrics["learning_rate"], CONFIG.learning_rate, rtol=1e-5)
     assert np.isfinite(list(metrics.values())).all()
+    rates = []
     for _ in range(TOTAL_UPDATES):
         new_state, metrics = update(learner_of("mlp", "fused"), new_state, trajectory)
-    final = CONFIG.learning_rate * CONFIG.final_learning_rate_share
-    np.testing.assert_allclose(metrics["learning_rate"], final, rtol=1e-5)
+        rates.append(metrics["learning_rate"])
+    share_done = np.minimum(np.arange(1, TOTAL_UPDATES + 1) / (TOTAL_UPDATES - 1), 1)
+    expected = CONFIG.learning_rate * (1 - share_done * (1 - CONFIG.final_learning_rate_share))
+    np.testing.assert_allclose(rates, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("execution", ["host", "fused"])
+def test_rate_falls_while_updates_move_the_policy_too_far_and_comes_back(execution: str) -> None:
+    state, trajectory = rollout("mlp")
+    too_far, too_near = (dataclasses.replace(CONFIG, kl_target=target) for target in (1e-9, 1e9))
+    falls, rises = (make_learner(built("mlp"), config, TOTAL_UPDATES, execution) for config in (too_far, too_near))
+    slower, first = update(falls, state, trajectory)
+    slowest, second = update(falls, slower, trajectory)
+    np.testing.assert_allclose([slower.rate_share, slowest.rate_share], [1 / 1.25, 1 / 1.25**2], rtol=1e-6)
+    scheduled = np.asarray([falls.schedule(0), falls.schedule(1)])
+    np.testing.assert_allclose([first["learning_rate"], second["learning_rate"]], scheduled * [1, 1 / 1.25], rtol=1e-6)
+    steps = [
+        np.abs(after.params["params"]["log_std"] - before.params["params"]["log_std"]).max()
+        for before, after in ((slower, slowest), (slower, update(rises, slower, trajectory)[0]))
+    ]
+    np.testing.assert_allclose(steps[0], steps[1], rtol=1e-5)  # a share changes the update after
+    shares = [slowest.rate_share]
+    for _ in range(3):
+        slowest, _ = update(rises, slowest, trajectory)
+        shares.append(slowest.rate_share)
+    np.testing.assert_allclose(shares, [1 / 1.25**2, 1 / 1.25, 1, 1], rtol=1e-6)
 
 
 @pytest.mark.parametrize("execution", ["host", "fused"])
@@ -256,7 +279,7 @@ def test_gradients_are_clipped_by_their_norm(limit: float) -> None:
     learner = make_learner(built("mlp"), config, TOTAL_UPDATES)
     new_state, metrics = update(learner, state, trajectory)
     _, adam = new_state.opt_state
-    moment = math.sqrt(sum(float((leaf**2).sum()) for leaf in jax.tree.leaves(adam[0].mu)))
+    moment = math.sqrt(sum(float((leaf**2).sum()) for leaf in jax.tree.leaves(adam.mu)))
     given = min(limit, metrics["gradient_norm"])
     np.testing.assert_allclose(moment, 0.1 * given, rtol=1e-4)
     assert (metrics["gradient_norm"] > limit) == (limit == 1e-3)
