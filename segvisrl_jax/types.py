@@ -24,6 +24,31 @@ class Outcome(enum.IntEnum):
 
 
 @struct.dataclass
+class Conditions:
+    """How one scene's conditions differ from the nominal ones (``config.ConditionsConfig`` says what each means).
+
+    A field is None where no scene of the environment differs in it: then nothing is computed for it.
+    """
+
+    sun_strength: Float32[Array, "*B"] | None = None
+    ground_albedo: Float32[Array, "*B"] | None = None
+    rock_albedo: Float32[Array, "*B"] | None = None
+    relief: Float32[Array, "*B"] | None = None
+    exposure: Float32[Array, "*B"] | None = None
+    sensor_noise_levels: Float32[Array, "*B"] | None = None
+    camera_height_offset_m: Float32[Array, "*B"] | None = None
+    camera_pitch_offset_deg: Float32[Array, "*B"] | None = None
+    class_flip_share: Float32[Array, "*B"] | None = None
+    border_px: Float32[Array, "*B"] | None = None
+    missed_rock_share: Float32[Array, "*B"] | None = None
+    num_ghost_rocks: Int32[Array, "*B"] | None = None
+    dropped_frame_share: Float32[Array, "*B"] | None = None
+    left_wheel_gain: Float32[Array, "*B"] | None = None
+    right_wheel_gain: Float32[Array, "*B"] | None = None
+    latency_s: Float32[Array, "*B"] | None = None
+
+
+@struct.dataclass
 class Scene:
     """One layout of the world: everything about an episode that does not move."""
 
@@ -34,6 +59,7 @@ class Scene:
     rock_shape: Int32[Array, "*B R"]  # row of the rock library; all different within a scene
     start_yaw_rad: Float32[Array, "*B"]  # the rover's heading at the start
     sun_direction: Float32[Array, "*B 3"]  # unit vector from the ground towards the sun
+    conditions: Conditions = Conditions()
 
 
 @struct.dataclass
@@ -57,6 +83,14 @@ class CameraPose:
 
 
 @struct.dataclass
+class Frame:
+    """Which image the agent sees: that from where the rover was after so many decisions."""
+
+    qpos: Float32[Array, "*B 11"]
+    num_decisions: Int32[Array, "*B"]
+
+
+@struct.dataclass
 class RoverState:
     """The whole state of one environment between two decisions."""
 
@@ -67,6 +101,8 @@ class RoverState:
     path_length_m: Float32[Array, "*B"]  # driven so far, over judged instants
     min_clearance_m: Float32[Array, "*B"]  # least distance to a rock's centre so far (inf without rocks)
     episode_return: Float32[Array, "*B"]
+    last_frame: Frame | None = None  # the last one that arrived, where frames are dropped
+    last_action: Float32[Array, "*B 2"] | None = None  # of the decision before, where there is latency
 
 
 @struct.dataclass

@@ -4,12 +4,13 @@ import json
 import shlex
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
 from segvisrl_jax.cli import parse
 from segvisrl_jax.config import ConfigError, EngineName, EnvConfig, RendererName, TrainConfig, require, to_dict
+from segvisrl_jax.config.conditions import ConditionsConfig
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class EvalOptions:
     """Where to write the result as JSON."""
     slots: int = 256
     """Episodes that are driven at the same time."""
+    conditions: ConditionsConfig = field(default_factory=ConditionsConfig)
 
     def __post_init__(self) -> None:
         require(1 <= self.episodes <= 10**7, "--episodes", self.episodes, "in [1, 10000000]")
@@ -68,7 +70,7 @@ def evaluate(asked: EvalOptions) -> dict[str, Any]:
     from segvisrl_jax.training.metrics import ProgressDisplay
 
     policy, params, config = load_driver(asked.run, asked.policy, asked.controller)
-    env_config = with_overrides(config, asked.num_rocks, asked.renderer, asked.physics)
+    env_config = with_overrides(config, asked.num_rocks, asked.renderer, asked.physics, asked.conditions)
     env = RoverEnv(env_config)
     evaluator = Evaluator(env, policy, min(asked.slots, asked.episodes))
     stream = scene_stream(asked.seed, TEST_STREAM)
@@ -116,9 +118,18 @@ def command_line(asked: EvalOptions) -> str:
     words = ["segvisrl", "eval"]
     for f in fields(asked):
         value = getattr(asked, f.name)
-        if f.name in ("episodes", "seed") or (f.name != "json" and value != f.default):
-            words += ["--" + f.name.replace("_", "-"), str(value)]
+        if f.name in ("episodes", "seed") or (f.name not in ("json", "conditions") and value != f.default):
+            words += [_option(f.name), str(value)]
+    for f in fields(asked.conditions):
+        value = getattr(asked.conditions, f.name)
+        if value != f.default:
+            option = _option(f"conditions.{f.name}")
+            words += [option] if value is True else [option, str(value)]
     return shlex.join(words)
+
+
+def _option(name: str) -> str:
+    return "--" + name.replace("_", "-")
 
 
 def machine_record() -> dict[str, Any]:
@@ -177,11 +188,14 @@ def held_out(config: TrainConfig) -> EnvConfig:
     return held_out_env(config.env)
 
 
-def with_overrides(config: EnvConfig, num_rocks, renderer, physics) -> EnvConfig:
+def with_overrides(
+    config: EnvConfig, num_rocks, renderer, physics, conditions: ConditionsConfig | None = None
+) -> EnvConfig:
     """The settings with the command line's exceptions."""
     from segvisrl_jax.config import replace_fields
 
-    named = {"num_rocks": num_rocks, "renderer": renderer, "engine": physics}
+    shifted = conditions if conditions != ConditionsConfig() else None
+    named = {"num_rocks": num_rocks, "renderer": renderer, "engine": physics, "conditions": shifted}
     return replace_fields(config, **{name: value for name, value in named.items() if value is not None})
 
 

@@ -199,6 +199,7 @@ def _rules(evaluation: Evaluation) -> dict[str, Any]:
         "seed": evaluation.seed,
         "episodes": evaluation.episodes,
         **{f"scene.{name}": value for name, value in dataclasses.asdict(config.scene).items()},
+        **{f"conditions.{name}": value for name, value in dataclasses.asdict(config.conditions).items()},
         **{f"task.{name}": getattr(config.task, name) for name in task},
         **{f"physics.{name}": getattr(config.physics, name) for name in WORLD},
     }

@@ -5,6 +5,7 @@ Nothing here depends on JAX or MuJoCo.
 """
 
 from segvisrl_jax.config.checks import ConfigError, require
+from segvisrl_jax.config.conditions import ConditionsConfig
 from segvisrl_jax.config.environment import CameraConfig, EnvConfig, PhysicsConfig, SceneConfig, TaskConfig
 from segvisrl_jax.config.learning import EvaluationConfig, NetworkConfig, PPOConfig, TrainConfig
 from segvisrl_jax.config.names import (
@@ -24,6 +25,7 @@ __all__ = [
     "IMAGE_OBSERVATIONS",
     "Arch",
     "CameraConfig",
+    "ConditionsConfig",
     "ConfigError",
     "EngineName",
     "EnvConfig",

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field
 
 from segvisrl_jax.config.checks import require, require_choice, require_divides, require_finite_numbers
+from segvisrl_jax.config.conditions import NEUTRAL, SCANLINE_ONLY, ConditionsConfig
 from segvisrl_jax.config.names import EngineName, ObservationKind, RendererName
 
 
@@ -23,8 +24,9 @@ class SceneConfig:
     """... and at most this far (ours: at 0.16 m/s, 100 s cover 16 m)."""
     num_rocks: int = 4
     """Rocks on the map (paper: 4)."""
-    random_num_rocks: bool = False
-    """Each scene has a uniformly random number of rocks from 0 to num_rocks (ours; for training)."""
+    random_num_rocks_max: int = 0
+    """Above 0: each training scene has a uniformly random number of rocks from 0 to this, in place of num_rocks (ours;
+    held-out scenes always have num_rocks)."""
     rock_start_clearance_m: float = 4.0
     """Least distance of a rock's centre from the start (paper)."""
     rock_goal_clearance_m: float = 1.75
@@ -41,6 +43,11 @@ class SceneConfig:
     """Direction towards the sun, from x (forward) towards y (left); only RGB images see it."""
     sun_elevation_deg: float = 30.0
     """Height of the sun above the horizon."""
+
+    @property
+    def most_rocks(self) -> int:
+        """Most rocks that a scene can have."""
+        return self.random_num_rocks_max or self.num_rocks
 
     @property
     def start_xy_m(self) -> tuple[float, float]:
@@ -64,12 +71,10 @@ class SceneConfig:
         )
         require(self.num_rock_shapes >= 1, f"{p}.num_rock_shapes", self.num_rock_shapes, "at least 1")
         require(self.num_rock_shapes <= 1024, f"{p}.num_rock_shapes", self.num_rock_shapes, "at most 1024")
-        require(type(self.random_num_rocks) is bool, f"{p}.random_num_rocks", self.random_num_rocks, "True or False")
-        rocks = self.num_rocks
-        require(rocks >= 0, f"{p}.num_rocks", rocks, "0 or more")
-        require(
-            rocks <= self.num_rock_shapes, f"{p}.num_rocks", rocks, f"at most num_rock_shapes = {self.num_rock_shapes}"
-        )
+        for name in ("num_rocks", "random_num_rocks_max"):
+            rocks, shapes = getattr(self, name), self.num_rock_shapes
+            require(rocks >= 0, f"{p}.{name}", rocks, "0 or more")
+            require(rocks <= shapes, f"{p}.{name}", rocks, f"at most num_rock_shapes = {shapes}")
         small, large = self.rock_radius_min_m, self.rock_radius_max_m
         require(small >= 0.02, f"{p}.rock_radius_min_m", small, "at least 0.02")
         require(large >= small, f"{p}.rock_radius_max_m", large, f"at least rock_radius_min_m = {small}")
@@ -89,7 +94,8 @@ class SceneConfig:
         free = self.map_size_m**2 - kept_clear
         most = max(0, int(0.9 * free / per_rock))
         should = f"at most {most} for rocks of {self.rock_radius_max_m} m on this map, so that they fit without overlap"
-        require(self.num_rocks <= most, "scene.num_rocks", self.num_rocks, should)
+        for name in ("num_rocks", "random_num_rocks_max"):
+            require(getattr(self, name) <= most, f"scene.{name}", getattr(self, name), should)
 
 
 @dataclass(frozen=True)
@@ -220,6 +226,7 @@ class EnvConfig:
     task: TaskConfig = field(default_factory=TaskConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
+    conditions: ConditionsConfig = field(default_factory=ConditionsConfig)
 
     def __post_init__(self) -> None:
         require_choice(self.obs, ObservationKind, "env.obs")
@@ -233,3 +240,22 @@ class EnvConfig:
         clearance, needed = self.scene.rock_goal_clearance_m, limit + self.task.collision_margin_m
         should = f"more than task.collision_radius_m + collision_margin_m = {needed}, so that the goal can be reached"
         require(clearance > needed, "scene.rock_goal_clearance_m", clearance, should)
+        self._require_conditions_that_fit()
+
+    def _require_conditions_that_fit(self) -> None:
+        """What conditions ask of the other parts."""
+        p, conditions, judge_dt = "conditions", self.conditions, self.task.judge_dt_s
+        latency, count = conditions.latency_s, conditions.latency_s / judge_dt
+        fits = abs(count - round(count)) < 1e-6 and round(count) <= self.task.num_judgements
+        should = f"a multiple of task.judge_dt_s = {judge_dt}, at most task.decision_dt_s = {self.task.decision_dt_s}"
+        require(fits, f"{p}.latency_s", latency, should)
+        varied = conditions.varied(self.obs)
+        if self.renderer in ("gl", "warp"):
+            for name in (name for name in SCANLINE_ONLY if name in varied):
+                name, neutral = ("randomize", False) if conditions.draws(name) else (name, NEUTRAL[name])
+                should = f"{neutral!r} with env.renderer = {self.renderer!r}; scanline draws it"
+                require(False, f"{p}.{name}", getattr(conditions, name), should)
+        if "num_ghost_rocks" in varied:
+            needed, shapes = self.scene.most_rocks + conditions.most_ghost_rocks, self.scene.num_rock_shapes
+            should = f"at least {needed}, one for every rock and every ghost (conditions.num_ghost_rocks, randomize)"
+            require(shapes >= needed, "scene.num_rock_shapes", shapes, should)

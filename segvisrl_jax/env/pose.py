@@ -9,21 +9,21 @@ from flax import struct
 from jax import numpy as jnp
 from jaxtyping import Array, Float32
 
-from segvisrl_jax.types import CameraPose, PhysicsState
+from segvisrl_jax.types import CameraPose, Frame, PhysicsState
 
 CAMERA_NAME = "d435"
 
 
 @struct.dataclass
 class CameraMount:
-    """Where the camera sits on the rover, in the rover's frame; constants of the model."""
+    """Where the camera sits on the rover, in the rover's frame."""
 
-    position_m: Float32[np.ndarray, "3"]
-    rotation: Float32[np.ndarray, "3 3"]  # columns: the camera's right, up and backward axes
+    position_m: Float32[np.ndarray | Array, "3"]
+    rotation: Float32[np.ndarray | Array, "3 3"]  # columns: the camera's right, up and backward axes
 
 
 def camera_mount(model: mujoco.MjModel, name: str = CAMERA_NAME) -> CameraMount:
-    """The mount of a camera that is fixed to the rover's body."""
+    """The mount of a camera that is fixed to the rover's body: constants of the model."""
     camera = model.camera(name)
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, camera.quat)
@@ -33,7 +33,7 @@ def camera_mount(model: mujoco.MjModel, name: str = CAMERA_NAME) -> CameraMount:
     )
 
 
-def camera_pose(physics: PhysicsState, mount: CameraMount) -> CameraPose:
+def camera_pose(physics: PhysicsState | Frame, mount: CameraMount) -> CameraPose:
     """Where the camera is in the world, and how it looks."""
     body = rotation_matrix(physics.qpos[..., 3:7])
     offset = _product(body, jnp.asarray(mount.position_m)[:, None])[..., 0]

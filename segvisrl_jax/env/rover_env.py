@@ -9,16 +9,29 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from brax.envs.base import Env, State
-from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt8
+from jaxtyping import Array, Bool, Int32, PRNGKeyArray, Shaped, UInt8, UInt32
 
 from segvisrl_jax.config import IMAGE_OBSERVATIONS, EngineName, EnvConfig, ObservationKind, RendererName, replace_fields
 from segvisrl_jax.env import model, rocks, task
+from segvisrl_jax.env.conditions import (
+    first_memory,
+    frame_key,
+    frame_words,
+    moved_mount,
+    next_memory,
+    seen_frame,
+    segmented_scene,
+    wheel_shares,
+    with_conditions,
+)
 from segvisrl_jax.env.physics import make_engine
-from segvisrl_jax.env.pose import camera_mount, camera_pose, in_rover_frame, up_z, yaw_rad
+from segvisrl_jax.env.pose import camera_mount, camera_pose, up_z
 from segvisrl_jax.env.scene import sample_scene
+from segvisrl_jax.env.vector import vector_observation, vector_size
 from segvisrl_jax.types import (
     Action,
     CameraPose,
+    Frame,
     Observation,
     Outcome,
     PhysicsState,
@@ -29,15 +42,12 @@ from segvisrl_jax.types import (
 )
 from segvisrl_jax.vision.batching import one_by_one_on_cpu
 from segvisrl_jax.vision.classes import PALETTE
+from segvisrl_jax.vision.conditions import developed, flipped, is_random
 from segvisrl_jax.vision.renderer import InGraphRenderer, Renderer, make_renderer
 from segvisrl_jax.vision.resample import colour_and_resample, resample_taps, tap_plan
 
-TYPICAL_TURN_RATE_RAD_S = 0.5  # scales the turn rate in the state observation to about 1
-STATE_SIZE = 7
-NUM_NEAREST_ROCKS = 8  # that a vector holds: at 64 rocks on the map, those within 5 m
-ROCK_SIZE = 3  # forward, left, closeness
-ROCK_RANGE_M = 6.0  # rocks beyond are left out: half a minute's drive
-ROCK_SCALE_M = 4.0  # scales a rock's place to about 1
+FrameWords = UInt32[Array, "6"] | None  # None where nothing in a frame is random
+Look = Callable[[Scene, CameraPose, FrameWords], UInt8[Array, "H W 3"]]
 
 
 class RoverEnv(Env):
@@ -49,12 +59,13 @@ class RoverEnv(Env):
         ``state``: (7,) float32: goal in the rover's frame over the largest goal distance (x, y), sine and cosine of
         the heading, forward and sideways speed over the top speed, turn rate over 0.5 rad/s.
         ``state_and_rocks``: (31,) float32: ``state``, then for each of the 8 nearest rocks within 6 m, the nearest
-        first: its centre in the rover's frame over 4 m (x, y), and the collision radius over its distance, which is 1
+        first: its direction in the rover's frame (x, y), and the collision radius over its distance, which is 1
         where the episode ends. Zeros where there are fewer.
     Action: (2,) float32, left and right wheel speed as a share of the top speed, clipped to [0, 1]. No reverse.
     Reward: see ``env.task``; one decision a second, judged every 0.2 s.
     Termination: success, collision, fall, or physics that diverged. Truncation: the time limit.
     Reset: a fresh scene for every key.
+    Conditions: ``config.conditions`` shifts what is seen and how wheels follow; ``scene.conditions`` holds the values.
 
     ``reset`` and ``step`` are for one environment; ``jax.jit`` and ``jax.vmap`` them. Training goes through
     ``initial_state``, ``advance`` and ``observe``, so that an automatic reset draws one image and not two.
@@ -126,20 +137,22 @@ class RoverEnv(Env):
     def initial_state(self, key: PRNGKeyArray) -> RoverState:
         """The start of an episode on a scene drawn from the key, without looking at it. Unbatched."""
         scene = sample_scene(key, self.config.scene, self.rocks)
-        return self.state_on(scene)
+        return self.state_on(with_conditions(key, scene, self.config))
 
     def state_on(self, scene: Scene) -> RoverState:
-        """The start of an episode on a given scene. Unbatched."""
+        """The start of an episode on a given scene, under the scene's own conditions. Unbatched."""
         start = jnp.asarray(self.config.scene.start_xy_m, jnp.float32)
         clearance = task.rock_clearance_m(start[None], scene)[0]
+        physics = self.engine.place(start, scene.start_yaw_rad)
         return RoverState(
-            physics=self.engine.place(start, scene.start_yaw_rad),
+            physics=physics,
             scene=scene,
             num_decisions=jnp.int32(0),
             outcome=jnp.int32(Outcome.RUNNING),
             path_length_m=jnp.float32(0.0),
             min_clearance_m=clearance,
             episode_return=jnp.float32(0.0),
+            **first_memory(physics, scene),  # type: ignore[arg-type]
         )
 
     def advance(self, state: RoverState, action: Action) -> tuple[RoverState, StepResult]:
@@ -148,7 +161,7 @@ class RoverEnv(Env):
         A state whose physics diverged keeps its last finite coordinates and gets the outcome ``UNSTABLE``.
         """
         num_decisions = state.num_decisions + jnp.int32(1)
-        judged = self.engine.advance(state.physics, action)
+        judged = self.engine.advance(state.physics, wheel_shares(state, action, self.config.task))
         track = _track(judged)
         start_xy = state.physics.qpos[:2]
         rules = self.config.scene
@@ -168,6 +181,7 @@ class RoverEnv(Env):
             path_length_m=state.path_length_m + verdict.path_length_m,
             min_clearance_m=jnp.minimum(state.min_clearance_m, verdict.min_clearance_m),
             episode_return=state.episode_return + reward,
+            **next_memory(state, action, physics, num_decisions),  # type: ignore[arg-type]
         )
         as_float = jnp.float32
         return rover, StepResult(reward, verdict.terms, terminated.astype(as_float), truncated.astype(as_float))
@@ -175,58 +189,40 @@ class RoverEnv(Env):
     def observe(self, state: RoverState) -> Observation:
         """What the agent sees now. Unbatched."""
         if self._look is not None:
-            return self._look(state.scene, self.camera(state))
-        vector = self._state_vector(state)
-        return jnp.append(vector, self._rock_vector(state)) if self.config.obs == "state_and_rocks" else vector
+            scene, frame = state.scene, seen_frame(state)
+            words = frame_words(scene, frame) if is_random(scene.conditions) else None
+            return self._look(scene, self._camera_at(frame, scene), words)
+        return vector_observation(state, self.config)
 
     def camera(self, state: RoverState) -> CameraPose:
         """Where the camera is and how it looks. Unbatched."""
-        return camera_pose(state.physics, self._mount)
+        return self._camera_at(state.physics, state.scene)
 
-    def _make_look(self, renderer: Renderer) -> Callable[[Scene, CameraPose], UInt8[Array, "H W 3"]]:
+    def _camera_at(self, place: PhysicsState | Frame, scene: Scene) -> CameraPose:
+        return camera_pose(place, moved_mount(self._mount, scene.conditions))
+
+    def _make_look(self, renderer: Renderer) -> Look:
         """What draws and shrinks one image."""
 
-        def colours(scene: Scene, camera: CameraPose) -> UInt8[Array, "H W 3"]:
-            return resample_taps(self._taps(renderer.rgb(scene, camera)), self._plan)
+        def colours(scene: Scene, camera: CameraPose, words: FrameWords) -> UInt8[Array, "H W 3"]:
+            drawn = developed(_key_of(words), renderer.rgb(scene, camera), scene.conditions)
+            return resample_taps(self._taps(drawn), self._plan)
 
-        def classes(scene: Scene, camera: CameraPose) -> UInt8[Array, "H W 3"]:
-            if not isinstance(renderer, InGraphRenderer):
-                return colour_and_resample(self._taps(renderer.classes(scene, camera)), self._plan, PALETTE)
-            drawn, is_plain = renderer.classes_and_plain_rows(scene, camera)
-            return colour_and_resample(self._taps(drawn), self._plan, PALETTE, is_plain[self._row_taps])
+        def classes(scene: Scene, camera: CameraPose, words: FrameWords) -> UInt8[Array, "H W 3"]:
+            key, conditions = _key_of(words), scene.conditions
+            scene = segmented_scene(key, scene, camera, self.config)
+            drawn, is_plain = flipped(key, *_classes(renderer, scene, camera), conditions)
+            plain_taps = None if is_plain is None else is_plain[self._row_taps]
+            return colour_and_resample(self._taps(drawn), self._plan, PALETTE, plain_taps)
 
         look = colours if self.config.obs == "rgb" else classes
         return one_by_one_on_cpu(look) if isinstance(renderer, InGraphRenderer) else look
 
-    def _taps(self, drawn: UInt8[Array, "rows columns ..."]) -> UInt8[Array, "taps_h taps_w ..."]:
+    def _taps(self, drawn: Shaped[Array, "rows columns ..."]) -> Shaped[Array, "taps_h taps_w ..."]:
         """Rows and columns that downsampling reads more than once (at the border, and everywhere below scale 4)."""
         if drawn.shape[:2] == self._plan.tap_size:
             return drawn
         return drawn[self._row_taps][:, self._column_taps]
-
-    def _state_vector(self, state: RoverState) -> Float32[Array, "7"]:
-        qpos, qvel = state.physics.qpos, state.physics.qvel
-        heading = yaw_rad(qpos)
-        goal = in_rover_frame(state.scene.goal_xy_m - qpos[:2], heading)
-        velocity = in_rover_frame(qvel[:2], heading)
-        parts = [
-            goal / self.config.scene.goal_distance_max_m,
-            jnp.stack([jnp.sin(heading), jnp.cos(heading)]),
-            velocity / self.config.physics.top_speed_m_s,
-            qvel[5:6] / TYPICAL_TURN_RATE_RAD_S,
-        ]
-        return jnp.concatenate(parts).astype(jnp.float32)
-
-    def _rock_vector(self, state: RoverState) -> Float32[Array, "D"]:
-        """The nearest rocks, 3 numbers each, zeros where there are fewer."""
-        offset = state.scene.rock_xy_m - state.physics.qpos[:2]
-        nearness, order = jax.lax.top_k(-jnp.linalg.norm(offset, axis=-1), min(NUM_NEAREST_ROCKS, len(offset)))
-        distance = -nearness[:, None]
-        place = jax.vmap(in_rover_frame, in_axes=(0, None))(offset[order], yaw_rad(state.physics.qpos))
-        limit = self.config.task.collision_radius_m
-        rocks = jnp.concatenate([place / ROCK_SCALE_M, limit / jnp.maximum(distance, limit)], axis=-1)
-        seen = jnp.where(distance <= ROCK_RANGE_M, rocks, 0.0)
-        return jnp.pad(seen.ravel(), (0, NUM_NEAREST_ROCKS * ROCK_SIZE - seen.size)).astype(jnp.float32)
 
     # MuJoCo's view of it
 
@@ -280,8 +276,21 @@ def observation_shape(config: EnvConfig) -> tuple[int, ...]:
     """Shape of one observation, without building the environment."""
     if config.obs in IMAGE_OBSERVATIONS:
         return (*config.camera.observation_size_px, 3)
-    num_rocks = NUM_NEAREST_ROCKS if config.obs == "state_and_rocks" else 0
-    return (STATE_SIZE + num_rocks * ROCK_SIZE,)
+    return (vector_size(config.obs),)
+
+
+def _key_of(words: FrameWords) -> PRNGKeyArray:
+    """The key of a frame's randomness; any key where nothing is random."""
+    return jax.random.key(0) if words is None else frame_key(words)
+
+
+def _classes(
+    renderer: Renderer, scene: Scene, camera: CameraPose
+) -> tuple[UInt8[Array, "rows columns"], Bool[Array, "rows"] | None]:
+    """Class ids, and which rows show one class only, where the renderer knows."""
+    if isinstance(renderer, InGraphRenderer):
+        return renderer.classes_and_plain_rows(scene, camera)
+    return renderer.classes(scene, camera), None
 
 
 def _track(judged: PhysicsState) -> task.Track:

@@ -24,19 +24,20 @@ def sample_scene(key: PRNGKeyArray, config: SceneConfig, rocks: ConvexSolids) ->
         rocks: the rock library (``env.rocks.rock_library(config)``).
 
     Returns:
-        A scene with ``config.num_rocks`` rocks: the goal uniform over the part of the map between the least and the
+        A scene with ``config.most_rocks`` rocks: the goal uniform over the part of the map between the least and the
         largest distance from the start; each rock uniform over the part of the map that keeps clear of start, goal
-        and earlier rocks, each of a different shape. With ``random_num_rocks``, some of them stand far outside the map.
+        and earlier rocks, each of a different shape. With ``random_num_rocks_max``, a random number of them
+        stands far outside the map.
     """
     goal_key, shape_key, place_key, yaw_key, start_key = jax.random.split(key, 5)
     goal_xy = _sample_goal(goal_key, config)
-    shape = jax.random.permutation(shape_key, config.num_rock_shapes)[: config.num_rocks]
+    shape = jax.random.permutation(shape_key, config.num_rock_shapes)[: config.most_rocks]
     shape = shape.astype(jnp.int32)
     rock_xy = _place_rocks(place_key, config, goal_xy, jnp.asarray(rocks.radius_m)[shape])
-    if config.random_num_rocks:
-        number = jax.random.randint(jax.random.fold_in(shape_key, 1), (), 0, config.num_rocks + 1)
-        rock_xy = jnp.where(jnp.arange(config.num_rocks)[:, None] < number, rock_xy, FAR_AWAY_M)
-    yaw = jax.random.uniform(yaw_key, (config.num_rocks + 1,), minval=-jnp.pi, maxval=jnp.pi)
+    if config.random_num_rocks_max:
+        number = jax.random.randint(jax.random.fold_in(shape_key, 1), (), 0, config.most_rocks + 1)
+        rock_xy = jnp.where(jnp.arange(config.most_rocks)[:, None] < number, rock_xy, FAR_AWAY_M)
+    yaw = jax.random.uniform(yaw_key, (config.most_rocks + 1,), minval=-jnp.pi, maxval=jnp.pi)
     return Scene(
         goal_xy_m=goal_xy,
         goal_yaw_rad=yaw[-1],
@@ -69,10 +70,10 @@ def _place_rocks(
     key: PRNGKeyArray, config: SceneConfig, goal_xy: Float32[Array, "2"], radius: Float32[Array, "R"]
 ) -> Float32[Array, "R 2"]:
     """One rock after another, each drawn until it keeps clear of start, goal and the rocks before it."""
-    if config.num_rocks == 0:
+    if config.most_rocks == 0:
         return jnp.zeros((0, 2), jnp.float32)
     start = jnp.asarray(config.start_xy_m, jnp.float32)
-    nowhere = jnp.full((config.num_rocks, 2), FAR_AWAY_M, jnp.float32)
+    nowhere = jnp.full((config.most_rocks, 2), FAR_AWAY_M, jnp.float32)
 
     def place(placed: Array, rock: tuple[Array, PRNGKeyArray]) -> tuple[Array, None]:
         index, rock_key = rock
@@ -85,8 +86,8 @@ def _place_rocks(
 
         return placed.at[index].set(_draw_until(rock_key, config.map_size_m, is_allowed)), None
 
-    keys = jax.random.split(key, config.num_rocks)
-    placed, _ = jax.lax.scan(place, nowhere, (jnp.arange(config.num_rocks), keys))
+    keys = jax.random.split(key, config.most_rocks)
+    placed, _ = jax.lax.scan(place, nowhere, (jnp.arange(config.most_rocks), keys))
     return placed
 
 

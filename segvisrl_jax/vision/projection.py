@@ -228,14 +228,14 @@ def _away_from_zero(number: Float32[Array, ""]) -> Float32[Array, ""]:
 
 
 def spans(
-    sides: Sides, row_centres_px: Float32[Array, "rows"]
+    sides: Sides, row_centres_px: Float32[Array, "rows"] | Float32[Array, "*N rows"]
 ) -> tuple[Float32[Array, "*N rows"], Float32[Array, "*N rows"]]:
-    """The smallest and the largest crossing of every polygon's sides (*N, K) with every row.
+    """The smallest and the largest crossing of every polygon's sides (*N, K) with every row, or every one of its own.
 
     Returns:
         Two arrays of u in pixels; the first is greater than the second where there is no crossing.
     """
-    shape = (*sides.slope.shape[:-1], len(row_centres_px))
+    shape = (*sides.slope.shape[:-1], row_centres_px.shape[-1])
     left, right = jnp.full(shape, NO_CROSSING_PX), jnp.full(shape, -NO_CROSSING_PX)
     # Written out side by side: one vectorised loop over rows. XLA's reduction takes a CPU four times as long.
     for number in range(sides.slope.shape[-1]):

@@ -22,8 +22,9 @@ from jaxtyping import Array, Bool, Int, Int32, UInt8
 
 from segvisrl_jax.config import EnvConfig, require
 from segvisrl_jax.env.rocks import concatenate_solids, goal_beacon, rock_library
-from segvisrl_jax.types import CameraPose, Scene
+from segvisrl_jax.types import CameraPose, Conditions, Scene
 from segvisrl_jax.vision.batching import one_by_one_on_cpu
+from segvisrl_jax.vision.borders import grown_box, grown_spans
 from segvisrl_jax.vision.classes import SegmentationClass
 from segvisrl_jax.vision.painting import (
     Columns,
@@ -143,8 +144,7 @@ class ScanlineRenderer:
                 return jnp.where(window.cover(span), solid.kind, part)
 
             image, is_plain = drawn
-            sides = self._sides(solid, camera)
-            box, span = sides.box(), self._columns_in(sides)
+            box, span = self._segmented(self._sides(solid, camera), scene.conditions)
             v_px = self._lines.v_px
             is_touched = (v_px > box.top_px) & (v_px <= box.bottom_px)
             return paint_in_windows(image, box, paint, self._lines, CLASS_WINDOW), is_plain & ~is_touched
@@ -153,9 +153,10 @@ class ScanlineRenderer:
 
     def _paint_all_classes(self, scene: Scene, camera: CameraPose) -> ClassRows:
         solids = self._solids(scene, camera, self._far_to_near(scene, camera)[0])
-        spans = (self._ground(camera), self._columns_in(jax.vmap(lambda solid: self._sides(solid, camera))(solids)))
+        sides = jax.vmap(lambda solid: self._sides(solid, camera))(solids)
+        _, outlines = self._segmented(sides, scene.conditions)
         # Without the barrier, XLA works out every span anew for every pixel in it.
-        ground, outlines, kind = jax.lax.optimization_barrier((*spans, solids.kind))
+        ground, outlines, kind = jax.lax.optimization_barrier((self._ground(camera), outlines, solids.kind))
         image = jnp.where(ground.cover(self._lines.columns), GROUND, SPACE)
         for number in range(len(solids.kind)):
             image = jnp.where(_take(outlines, number).cover(self._lines.columns), kind[number], image)
@@ -169,7 +170,8 @@ class ScanlineRenderer:
 
         def add(solid: Solid, picture: Picture) -> Picture:
             sides = self._sides(solid, camera)
-            paint = self._solid_painter(self._columns_in(sides), self._faces(solid, scene, camera), solid.kind)
+            layer = (self._columns_in(sides), self._faces(solid, scene, camera), solid.kind)
+            paint = self._solid_painter(*layer, scene.conditions)
             return paint_in_windows(picture, sides.box(), paint, self._lines, COLOUR_WINDOW)
 
         return self._add_seen(scene, camera, picture, add)
@@ -184,7 +186,8 @@ class ScanlineRenderer:
         picture = self._ground_painter(span, shadows, scene, camera)(Picture.of_space(self._lines), whole)
 
         def add(number: Array, picture: Picture) -> Picture:
-            return self._solid_painter(*_take(tuple(seen), number))(picture, whole)
+            outline, its_faces, kind = _take(tuple(seen), number)
+            return self._solid_painter(outline, its_faces, kind, scene.conditions)(picture, whole)
 
         return jax.lax.fori_loop(0, len(solids.kind), add, picture)
 
@@ -193,16 +196,20 @@ class ScanlineRenderer:
 
         def paint(picture: Picture, window: Window) -> Picture:
             lines = window.lines
-            sun, surface = ground_light(lines.u_px, lines.v_px, camera, scene.sun_direction, self._projection)
+            sun, surface = ground_light(lines.u_px, lines.v_px, camera, scene, self._projection)
             for number in range(shadows.first.shape[0]):
                 sun = jnp.where(window.cover(_take(shadows, number)), 0.0, sun)
-            return picture.cover(window.cover(span), self._surfaces.light_on(sun) * surface, GROUND)
+            light = self._surfaces.light_on(sun, scene.conditions) * surface
+            return picture.cover(window.cover(span), light, GROUND)
 
         return paint
 
-    def _solid_painter(self, span: Columns, faces: Faces, kind: Array) -> Paint:
+    def _solid_painter(self, span: Columns, faces: Faces, kind: Array, conditions: Conditions) -> Paint:
         def paint(picture: Picture, window: Window) -> Picture:
-            light = self._surfaces.light_on(face_light(faces, window.lines.u_px, window.lines.v_px))
+            sun = face_light(faces, window.lines.u_px, window.lines.v_px)
+            light = self._surfaces.light_on(sun, conditions)
+            if conditions.rock_albedo is not None:
+                light = jnp.where(kind == ROCK, conditions.rock_albedo, 1.0) * light
             return picture.cover(window.cover(span), light, kind)
 
         return paint
@@ -256,6 +263,13 @@ class ScanlineRenderer:
 
     def _columns_in(self, sides: Sides) -> Columns:
         return self._columns_between(*spans(sides, self._lines.v_px))
+
+    def _segmented(self, sides: Sides, conditions: Conditions) -> tuple[Box, Columns]:
+        """Where segmentation sees a solid, or several: too large or too small under such conditions."""
+        border = conditions.border_px
+        if border is None:
+            return sides.box(), self._columns_in(sides)
+        return grown_box(sides.box(), border), self._columns_between(*grown_spans(sides, self._lines.v_px, border))
 
     def _columns_between(self, left_px: Array, right_px: Array) -> Columns:
         """The columns whose centres are in [left, right), in every wanted row."""

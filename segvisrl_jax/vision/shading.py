@@ -16,7 +16,7 @@ from flax import struct
 from jaxtyping import Array, Float32, UInt8, UInt32
 
 from segvisrl_jax.assets import asset_dir
-from segvisrl_jax.types import CameraPose
+from segvisrl_jax.types import CameraPose, Conditions, Scene
 from segvisrl_jax.vision.classes import SegmentationClass
 from segvisrl_jax.vision.polyhedra import Polyhedra
 from segvisrl_jax.vision.projection import Projection, Stand, camera_axes, rotate
@@ -53,9 +53,10 @@ class Surfaces:
         fill = float(np.mean(spec.visual.headlight.ambient))
         return cls(colours, fill, float(np.mean(spec.light("sun").diffuse)))
 
-    def light_on(self, sun: Float32[Array, "*P"]) -> Float32[Array, "*P"]:
+    def light_on(self, sun: Float32[Array, "*P"], conditions: Conditions) -> Float32[Array, "*P"]:
         """Brightness of a surface with so much sun on it (1: at right angles)."""
-        return self.fill + self.sun * sun
+        strength = conditions.sun_strength
+        return self.fill + (self.sun if strength is None else self.sun * strength) * sun
 
     def paint(
         self, light: Float32[Array, "rows columns"], kind: UInt8[Array, "rows columns"]
@@ -76,10 +77,11 @@ def ground_light(
     u_px: Float32[Array, "columns"],
     v_px: Float32[Array, "rows"],
     camera: CameraPose,
-    sun_direction: Float32[Array, "3"],
+    scene: Scene,
     projection: Projection,
 ) -> tuple[Float32[Array, "rows columns"], Float32[Array, "rows columns"]]:
     """(how much sun falls on the ground, how light its surface is), where each pixel's ray meets it."""
+    sun_direction, conditions = scene.sun_direction, scene.conditions
     axes = camera_axes(camera)
     across = (u_px - projection.width_px / 2) / projection.focal_px
     down = (v_px - projection.height_px / 2) / projection.focal_px
@@ -96,8 +98,12 @@ def ground_light(
         height += strength * form[0] / len(RELIEF)
         slope_x += strength * steepness * (cos * form[1] - sin * form[2])
         slope_y += strength * steepness * (sin * form[1] + cos * form[2])
+    if conditions.relief is not None:
+        slope_x, slope_y = conditions.relief * slope_x, conditions.relief * slope_y
     sun = sun_direction[2] - slope_x * sun_direction[0] - slope_y * sun_direction[1]
-    return jnp.where(sun_direction[2] > 0.0, jnp.maximum(sun, 0.0), 0.0), 1.0 + STAIN * height
+    surface = 1.0 + STAIN * height
+    surface = surface if conditions.ground_albedo is None else conditions.ground_albedo * surface
+    return jnp.where(sun_direction[2] > 0.0, jnp.maximum(sun, 0.0), 0.0), surface
 
 
 def _waves(x: Array, y: Array, seed: int) -> tuple[Array, Array, Array]:

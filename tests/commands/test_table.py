@@ -311,6 +311,26 @@ def test_the_recorded_command_asks_for_the_same_evaluation(folder):
     assert read(folder / "p.json")["command"] == f"segvisrl eval --controller p --episodes {EPISODES} --seed 3"
 
 
+def test_shifted_conditions_are_asked_for_recorded_and_not_mixed_with_others(folder, tmp_path, capsys):
+    words = ["--conditions.left-wheel-gain", "0.7", "--conditions.randomize"]
+    shifted = tmp_path / "shifted.json"
+    asked = ["--controller", "p", "--episodes", str(EPISODES), "--seed", "3", *words]
+    assert main(["eval", *asked, "--json", str(shifted)]) == 0
+    plain, data = read(folder / "p.json"), read(shifted)
+    assert data["config"].pop("conditions") == {
+        **plain["config"].pop("conditions"),
+        "left_wheel_gain": 0.7,
+        "randomize": True,
+    }
+    assert data["config"] == plain["config"]
+    assert data["per_episode"]["path_length_m"] != plain["per_episode"]["path_length_m"]
+    assert data["per_episode"]["shortest_path_m"] == plain["per_episode"]["shortest_path_m"]
+    again = shlex.split(data["command"])[2:]
+    assert parse(EvalOptions, again, "eval") == parse(EvalOptions, asked, "eval")
+    line = refusal(capsys, folder / "random.json", shifted)
+    assert f"{shifted}: conditions.randomize = True: should be False, as in {folder / 'random.json'}" in line
+
+
 def test_the_record_of_a_thousand_episodes_is_below_100_kilobytes(folder):
     text = (folder / "mlp.json").read_text()
     head, record = text.split('"per_episode"')

@@ -146,7 +146,7 @@ def test_rock_observation_by_hand():
     assert env.renderer is None
     # from (1, 2), facing along y: 2 m ahead, 4 m to the left, 5 m behind and to the right, and 6.01 m away: too far
     rover = rover_among(env, [[-3, 2], [1, -4.01], [1, 4], [4, -2]])
-    expected = [[0.5, 0.0, 0.25], [0.0, 1.0, 0.125], [-1.0, -0.75, 0.1]]
+    expected = [[1.0, 0.0, 0.25], [0.0, 1.0, 0.125], [-0.8, -0.6, 0.1]]
     seen = seen_rocks(env, rover)
     np.testing.assert_allclose(seen[:3], expected, atol=1e-6)
     assert np.all(seen[3:] == 0)
@@ -161,7 +161,7 @@ def test_rock_observation_holds_the_nearest_in_any_order_and_never_exceeds_one()
     angle = 2.4 * np.arange(12)
     rocks = np.array([1.0, 2.0]) + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     seen = seen_rocks(env, rover_among(env, rocks))
-    np.testing.assert_allclose(np.linalg.norm(seen[:, :2], axis=1) * 4, distance[:8], atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(seen[:, :2], axis=1), np.minimum(1, distance[:8] / 0.5), atol=1e-5)
     np.testing.assert_allclose(seen[:, 2], np.minimum(1, 0.5 / distance[:8]), atol=1e-5)
     shuffled = np.random.default_rng(0).permutation(rocks)
     assert not np.array_equal(shuffled[:8], rocks[:8])

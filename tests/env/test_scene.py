@@ -178,11 +178,12 @@ def test_sampling_is_jittable_and_typed():
     assert not any(getattr(leaf, "weak_type", False) for leaf in jax.tree.leaves(one))
 
 
-def test_a_random_number_of_rocks_is_uniform_from_none_to_all():
-    config = SceneConfig(num_rocks=4, random_num_rocks=True)
+def test_a_random_number_of_rocks_is_uniform_from_none_to_the_most():
+    config = SceneConfig(num_rocks=2, random_num_rocks_max=4)
     scene = scenes(config, 7)
     is_placed = np.all(np.abs(scene.rock_xy_m) <= config.map_size_m / 2, axis=-1)
     share = np.bincount(is_placed.sum(axis=-1), minlength=5) / NUM_KEYS
     np.testing.assert_allclose(share, 0.2, atol=0.03)  # 5 standard deviations
     assert np.all(np.linalg.norm(scene.rock_xy_m, axis=-1)[~is_placed] > 1000)
-    assert not held_out_env(EnvConfig(scene=config)).scene.random_num_rocks
+    held_out = held_out_env(EnvConfig(scene=config)).scene
+    assert scenes(held_out, 7).rock_xy_m.shape == (NUM_KEYS, 2, 2)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Float32
 
 from segvisrl_jax.config import EnvConfig
 from segvisrl_jax.env.model import WHEEL_NAMES
-from segvisrl_jax.types import Action, PhysicsState
+from segvisrl_jax.types import PhysicsState
 
 MAX_COORDINATE = 1e8
 """What is beyond this (SI units) has diverged; wheels turn by less in a million decisions."""
@@ -29,12 +29,13 @@ class PhysicsEngine(Protocol):
         """The rover at rest on the ground at a place and heading."""
         ...
 
-    def advance(self, state: PhysicsState, action: Action) -> PhysicsState:
-        """Drives for one decision with constant wheel speeds.
+    def advance(self, state: PhysicsState, action: Float32[Array, "*J 2"]) -> PhysicsState:
+        """Drives for one decision.
 
         Args:
             state: where the rover is, unbatched.
-            action: (2,) left and right wheel speed as a share of the top speed, clipped to [0, 1].
+            action: left and right wheel speed as a share of the top speed, clipped to [0, 1]: (2,) for all of the
+                decision, or (J, 2) for each interval that ends with a judged instant.
 
         Returns:
             The states at the judged instants, stacked: ``qpos`` (J, 11), ``qvel`` (J, 10). A state
@@ -64,19 +65,19 @@ def at_rest(xy_m: Float[Array, "2"], yaw_rad: Float[Array, ""], height_m: float)
     return PhysicsState(qpos=qpos, qvel=jnp.zeros(10, jnp.float32))
 
 
-def wheel_command(action: Float[Array, "2"], max_wheel_speed_rad_s: float) -> Float32[Array, "4"]:
+def wheel_command(action: Float[Array, "*J 2"], max_wheel_speed_rad_s: float) -> Float32[Array, "*J 4"]:
     """Wheel speeds in the actuators' order, from the two shares of the top speed."""
     share = jnp.clip(jnp.asarray(action, jnp.float32), 0.0, 1.0)
     side = np.array([0 if "left" in wheel else 1 for wheel in WHEEL_NAMES])
-    return share[side] * max_wheel_speed_rad_s
+    return share[..., side] * max_wheel_speed_rad_s
 
 
-def keep_diverged(start: PhysicsState, action: Float[Array, "2"], states: PhysicsState) -> PhysicsState:
+def keep_diverged(start: PhysicsState, action: Float[Array, "*J 2"], states: PhysicsState) -> PhysicsState:
     """Makes every state NaN from the first diverged one on; start and action count as the first.
 
     Args:
         start: where the decision began, unbatched.
-        action: (2,), as given by the caller.
+        action: as given by the caller.
         states: the J judged states.
     """
     started = _is_sound(start) & jnp.all(jnp.isfinite(action))

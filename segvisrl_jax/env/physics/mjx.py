@@ -8,7 +8,7 @@ from mujoco import mjx
 from segvisrl_jax.config import EnvConfig
 from segvisrl_jax.env.model import build_physics_model
 from segvisrl_jax.env.physics import engine
-from segvisrl_jax.types import Action, PhysicsState
+from segvisrl_jax.types import PhysicsState
 
 _Carry = tuple[Array, Array, Array]  # qpos, qvel, and the solver's warm start, which lives for one decision
 
@@ -32,15 +32,14 @@ class MjxEngine:
         """See ``PhysicsEngine.place``."""
         return engine.at_rest(xy_m, yaw_rad, self._rest_height_m)
 
-    def advance(self, state: PhysicsState, action: Action) -> PhysicsState:
+    def advance(self, state: PhysicsState, action: Float32[Array, "*J 2"]) -> PhysicsState:
         """See ``PhysicsEngine.advance``."""
         control = engine.wheel_command(action, self._max_wheel_speed)
+        controls = control if control.ndim == 2 else None  # one for each judged instant, or one for all
 
-        def step(carry: _Carry, _: None) -> tuple[_Carry, None]:
-            return self._step(carry, control), None
-
-        def judge(carry: _Carry, _: None) -> tuple[_Carry, PhysicsState]:
-            carry, _ = jax.lax.scan(step, carry, None, length=self._stride)
+        def judge(carry: _Carry, own: Array | None) -> tuple[_Carry, PhysicsState]:
+            held = control if own is None else own
+            carry, _ = jax.lax.scan(lambda c, _: (self._step(c, held), None), carry, None, length=self._stride)
             return carry, PhysicsState(qpos=carry[0], qvel=carry[1])
 
         start = (
@@ -50,7 +49,7 @@ class MjxEngine:
         )
         # Full float32 products: accelerators may take fewer bits by default, which moves the rover.
         with jax.default_matmul_precision("highest"):
-            _, states = jax.lax.scan(judge, start, None, length=self._num_judgements)
+            _, states = jax.lax.scan(judge, start, controls, length=self._num_judgements)
         return engine.keep_diverged(state, action, states)
 
     def _step(self, carry: _Carry, control: Float32[Array, "4"]) -> _Carry:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Float32
 from segvisrl_jax.config import ConfigError, EnvConfig
 from segvisrl_jax.env.model import build_physics_model
 from segvisrl_jax.env.physics import engine
-from segvisrl_jax.types import Action, PhysicsState
+from segvisrl_jax.types import PhysicsState
 
 
 def make_callbacks_safe() -> None:
@@ -60,9 +60,9 @@ class NativeEngine:
         """See ``PhysicsEngine.place``."""
         return engine.at_rest(xy_m, yaw_rad, self._rest_height_m)
 
-    def advance(self, state: PhysicsState, action: Action) -> PhysicsState:
+    def advance(self, state: PhysicsState, action: Float32[Array, "*J 2"]) -> PhysicsState:
         """See ``PhysicsEngine.advance``."""
-        control = engine.wheel_command(action, self._max_wheel_speed)
+        control = engine.wheel_command(action, self._max_wheel_speed).reshape(-1, 4)
         judged = (self._num_judgements,)
         shapes = tuple(jax.ShapeDtypeStruct((*judged, size), jnp.float32) for size in (11, 10))
         qpos, qvel = jax.pure_callback(
@@ -80,14 +80,17 @@ class NativeEngine:
     ) -> tuple[Float32[np.ndarray, "*B J 11"], Float32[np.ndarray, "*B J 10"]]:
         """The callback: any leading axes in, the same and J out. NumPy only: JAX can hang."""
         start = np.concatenate([np.asarray(qpos), np.asarray(qvel)], axis=-1).reshape(-1, 21)
-        states = self._roll_out(start, np.asarray(control).reshape(-1, 1, 4))
+        controls = np.asarray(control).reshape(len(start), -1, 4)
+        if controls.shape[1] > 1:
+            controls = controls.repeat(self._stride, axis=1)
+        states = self._roll_out(start, controls)
         states = states.astype(np.float32).reshape(*qpos.shape[:-1], self._num_judgements, 21)
         return states[..., :11], states[..., 11:]
 
     def _roll_out(
-        self, start: Float[np.ndarray, "B 21"], control: Float[np.ndarray, "B 1 4"]
+        self, start: Float[np.ndarray, "B 21"], control: Float[np.ndarray, "B S 4"]
     ) -> Float[np.ndarray, "B J 21"]:
-        """Judged states of a flat batch; NaN where MuJoCo warned.
+        """Judged states of a flat batch, with a control for each step, or one for all; NaN where MuJoCo warned.
 
         MuJoCo's full physics state is time, qpos, qvel; the solver starts cold. At a
         warning ``rollout`` stops stepping that trajectory and repeats its state, which may be
