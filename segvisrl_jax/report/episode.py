@@ -1,7 +1,8 @@
-"""One recorded episode: driving it, and the frames of its video (camera, segmentation, what the policy sees, map)."""
+"""Recorded episodes: driving them, and the frames of one's video (camera, segmentation, what the policy sees, map)."""
 
 import dataclasses
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -9,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 
-from segvisrl_jax.config import EnvConfig, replace_fields
+from segvisrl_jax.config import ObservationKind, replace_fields
 from segvisrl_jax.env.pose import camera_mount, camera_pose, yaw_rad
 from segvisrl_jax.env.rover_env import RoverEnv
+from segvisrl_jax.env.wrappers import select
 from segvisrl_jax.report.layout import SceneMap
 from segvisrl_jax.report.video import Pane, compose_frame, top_view_frame
 from segvisrl_jax.training.policy import Policy
@@ -19,10 +21,8 @@ from segvisrl_jax.types import Outcome, RoverState
 from segvisrl_jax.vision.classes import PALETTE
 from segvisrl_jax.vision.renderer import make_renderer
 
-VIEW_WIDTH_PX, VIEW_HEIGHT_PX = (
-    640,
-    360,
-)  # of the camera panes: the D435's picture at a third of its size
+VIEW_WIDTH_PX, VIEW_HEIGHT_PX = 640, 360  # of the camera panes: the D435's picture at a third of its size
+BATCH = 64  # episodes that are driven side by side
 HOLD_FRAMES = 8  # the last frame stays a second
 
 
@@ -31,12 +31,26 @@ class Episode:
     """States (T + 1, ...), from the start to the end, and what the policy saw in each."""
 
     states: RoverState
-    observations: UInt8[np.ndarray, "T H W 3"] | None  # None for a policy without images
+    observations: UInt8[np.ndarray, "T H W 3"] | None  # None without images, or where they were not kept
 
     @property
     def outcome(self) -> Outcome:
         """How it ended."""
         return Outcome(int(self.states.outcome[-1]))
+
+    @property
+    def num_decisions(self) -> int:
+        """How many it took."""
+        return int(self.states.num_decisions[-1])
+
+    @property
+    def min_clearance_m(self) -> float:
+        """The least distance to a rock's centre; infinite without rocks."""
+        return float(self.states.min_clearance_m[-1])
+
+    def state(self, step: int) -> RoverState:
+        """One of its states; -1 is the last."""
+        return jax.tree.map(lambda leaf: leaf[step], self.states)
 
     @property
     def xy_m(self) -> Float[np.ndarray, "T 2"]:
@@ -45,44 +59,84 @@ class Episode:
 
 
 def drive_episode(env: RoverEnv, policy: Policy, params: Any, stream: PRNGKeyArray, episode: int = 0) -> Episode:
-    """Drives one numbered scene of a stream to its end: the same one as ``Evaluator.run`` with that number."""
+    """Drives one numbered scene of a stream to its end: the same one as ``Evaluator.run`` with that number.
 
-    @jax.jit
-    def decide(params: Any, carry: Any, rover: RoverState, is_first: Array, key: PRNGKeyArray):
-        seen = jax.vmap(env.observe)(rover)
-        carry, action = policy.act(params, carry, rover, seen, is_first, key)
-        after, _ = jax.vmap(env.advance)(rover, action)
-        return carry, after, seen
+    Keeps what the policy saw.
+    """
+    driven = drive_episodes(env, policy, params, stream, [episode])[0]
+    return driven if len(env.observation_shape) != 3 else dataclasses.replace(driven, observations=_seen(env, driven))
 
-    scene_key = jax.random.fold_in(stream, episode)
-    rover = jax.jit(jax.vmap(env.initial_state))(scene_key[None])
-    carry, is_first = policy.initial_carry(1), jnp.ones(1, jnp.float32)
-    states, seen_images = [jax.device_get(rover)], []
-    while int(rover.outcome[0]) == Outcome.RUNNING:
-        key = jax.random.fold_in(scene_key, len(states))
-        carry, rover, seen = decide(params, carry, rover, is_first, key)
-        is_first = jnp.zeros(1, jnp.float32)
+
+def _seen(env: RoverEnv, episode: Episode) -> UInt8[np.ndarray, "T H W 3"]:
+    """What there was to see in each of its states."""
+    observe = jax.jit(env.observe)
+    return np.stack([np.asarray(observe(episode.state(step))) for step in range(len(episode.xy_m))])
+
+
+def drive_episodes(
+    env: RoverEnv,
+    policy: Policy,
+    params: Any,
+    stream: PRNGKeyArray,
+    episodes: Sequence[int],
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> list[Episode]:
+    """Drives numbered scenes of a stream to their ends, up to ``BATCH`` side by side; keeps states, not observations.
+
+    The scenes are those of ``Evaluator.run``, and what draws no actions drives them in the same way.
+    """
+    decide = jax.jit(functools.partial(_decide, env, policy))
+    start = jax.jit(jax.vmap(lambda number: env.initial_state(jax.random.fold_in(stream, number))))
+    size = min(BATCH, len(episodes))
+    driven: list[Episode] = []
+    for first in range(0, len(episodes), size):
+        numbers = list(episodes[first : first + size])
+        filled = jnp.array(numbers + numbers[-1:] * (size - len(numbers)), jnp.int32)
+        key = jax.random.fold_in(stream, int(filled[0]))
+        states = _drive_batch(decide, params, start(filled), policy.initial_carry(size), key)
+        driven += [_episode(states, place) for place in range(len(numbers))]
+        on_progress(len(driven))
+    return driven
+
+
+def _drive_batch(decide: Callable, params: Any, rover: RoverState, carry: Any, key: PRNGKeyArray) -> RoverState:
+    """States (T + 1, B, ...) of B episodes until the last one's end; those that ended before stand still."""
+    is_first = jnp.ones(rover.outcome.shape, jnp.float32)
+    states = [jax.device_get(rover)]
+    while np.any(states[-1].outcome == Outcome.RUNNING):
+        carry, rover = decide(params, carry, rover, is_first, jax.random.fold_in(key, len(states)))
+        is_first = jnp.zeros_like(is_first)
         states.append(jax.device_get(rover))
-        seen_images.append(np.asarray(seen[0]))
-    seen_images.append(np.asarray(jax.jit(env.observe)(jax.tree.map(lambda x: x[0], rover))))
-    stacked = jax.tree.map(lambda *leaves: np.concatenate(leaves), *states)
-    return Episode(stacked, np.stack(seen_images) if seen_images[0].ndim == 3 else None)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *states)
+
+
+def _decide(env: RoverEnv, policy: Policy, params: Any, carry: Any, rover: RoverState, is_first: Array, key: Array):
+    """One decision of every episode that is still going on."""
+    seen = jax.vmap(env.observe)(rover) if policy.observes else None
+    carry, action = policy.act(params, carry, rover, seen, is_first, key)
+    after, _ = jax.vmap(env.advance)(rover, action)
+    return carry, select(rover.outcome == Outcome.RUNNING, after, rover)
+
+
+def _episode(states: RoverState, place: int) -> Episode:
+    """One of B, without what follows its end."""
+    last = int(states.num_decisions[-1, place])
+    return Episode(jax.tree.map(lambda leaf: leaf[: last + 1, place], states), None)
 
 
 def episode_frames(env: RoverEnv, episode: Episode, title: str = "") -> Iterator[UInt8[np.ndarray, "H W 3"]]:
     """The frames of an episode's video, one a decision, the last one held."""
-    view = _view_config(env.config)
-    segmented, coloured = (_camera_view(env, replace_fields(view, obs=kind)) for kind in ("segmentation", "rgb"))
+    segmented, coloured = (camera_view(env, kind) for kind in ("segmentation", "rgb"))
     scene = scene_map(env, episode)
     last = len(episode.xy_m) - 1
     for step in range(last + 1):
-        rover = jax.tree.map(lambda leaf, i=step: leaf[i], episode.states)
+        rover = episode.state(step)
         camera = [
             Pane(np.asarray(coloured(rover)), "onboard camera"),
             Pane(np.asarray(segmented(rover)), "segmentation"),
         ]
         if episode.observations is not None:
-            camera.append(Pane(episode.observations[step], _observation_caption(env)))
+            camera.append(Pane(episode.observations[step], observation_caption(env)))
         heading = float(yaw_rad(rover.physics.qpos))
         above = top_view_frame(scene, episode.xy_m[: step + 1], heading)
         status = episode.outcome.name.lower() if step == last else "driving"
@@ -98,11 +152,11 @@ def episode_frames(env: RoverEnv, episode: Episode, title: str = "") -> Iterator
 
 def scene_map(env: RoverEnv, episode: Episode) -> SceneMap:
     """The episode's scene from above."""
-    scene = jax.tree.map(lambda leaf: np.asarray(leaf[0]), episode.states.scene)
+    scene = episode.state(0).scene
     return SceneMap(
         start_xy_m=np.asarray(env.config.scene.start_xy_m),
-        goal_xy_m=scene.goal_xy_m,
-        rock_xy_m=scene.rock_xy_m,
+        goal_xy_m=np.asarray(scene.goal_xy_m),
+        rock_xy_m=np.asarray(scene.rock_xy_m),
         rock_radius_m=env.rocks.radius_m[scene.rock_shape],
         map_half_size_m=env.config.scene.map_size_m / 2,
         collision_radius_m=env.config.task.collision_radius_m,
@@ -110,12 +164,9 @@ def scene_map(env: RoverEnv, episode: Episode) -> SceneMap:
     )
 
 
-def _view_config(config: EnvConfig) -> EnvConfig:
-    return replace_fields(config, width_px=VIEW_WIDTH_PX, height_px=VIEW_HEIGHT_PX, scale=1.0)
-
-
-def _camera_view(env: RoverEnv, config: EnvConfig):
-    """A jitted function from a state to the whole camera image, (360, 640, 3) uint8."""
+def camera_view(env: RoverEnv, kind: ObservationKind) -> Callable[[RoverState], UInt8[Array, "H W 3"]]:
+    """A jitted function from a state to the whole camera image, (360, 640, 3) uint8, in colour or segmented."""
+    config = replace_fields(env.config, obs=kind, width_px=VIEW_WIDTH_PX, height_px=VIEW_HEIGHT_PX, scale=1.0)
     camera = config.camera
     renderer = make_renderer(config, np.arange(camera.height_px), np.arange(camera.width_px))
     mount = camera_mount(env.mj_model)
@@ -129,6 +180,7 @@ def _camera_view(env: RoverEnv, config: EnvConfig):
     return jax.jit(draw)
 
 
-def _observation_caption(env: RoverEnv) -> str:
+def observation_caption(env: RoverEnv) -> str:
+    """What stands over the policy's image."""
     rows, columns, _ = env.observation_shape
     return f"what the policy sees, {columns} x {rows}"

@@ -19,6 +19,7 @@ from segvisrl_jax.config import require
 from segvisrl_jax.training.metrics import METRICS_FILE, STEP_KEY, read_metrics
 
 DOTS_PER_INCH = 100  # so a figure of 10 inches is 1000 pixels wide
+SHARP_DOTS_PER_INCH = 160  # of the figures of the results page, which are read closely
 SMOOTHED_SHARE = 0.02  # of a run: the window of the running mean that is drawn over the single updates
 FAILURES = (  # what an episode that did not succeed ended with: key, label, colour
     ("episode/collision", "collision", "#d55e00"),
@@ -186,11 +187,13 @@ def running_mean(values: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T"]:
 
 
 def _finish(axes: Axes) -> None:
+    """A frame, over decisions."""
     axes.xaxis.set_major_formatter(EngFormatter(sep=" "))
-    _clear_frame(axes)
+    clear_frame(axes)
 
 
-def _clear_frame(axes: Axes) -> None:
+def clear_frame(axes: Axes) -> None:
+    """A faint grid, and only the axes that carry numbers."""
     axes.grid(True, color="0.9", lw=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -225,7 +228,7 @@ def success_by_scale(rows: Sequence[Mapping[str, Any]], path_png: Path) -> Path:
     axes.margins(x=0.08)
     axes.set(xlabel="downsampling per axis", ylabel="success rate on test scenes", ylim=(-0.02, 1.02))
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-    _clear_frame(axes)
+    clear_frame(axes)
     axes.legend(loc="lower left")
     return save_figure(figure, path_png)
 
@@ -242,10 +245,10 @@ def _draw_sweep(axes: Axes, rows: Sequence[Mapping[str, Any]], arch: str, colour
     axes.plot(at * shift, means, color=colour, lw=1.8, label=arch)
 
 
-def save_figure(figure: Figure, path_png: Path) -> Path:
+def save_figure(figure: Figure, path_png: Path, dots_per_inch: int = DOTS_PER_INCH) -> Path:
     """Writes a PNG; its folder is made if it is missing."""
     path = Path(path_png)
     require(path.suffix == ".png", "path_png", str(path), "a name that ends in .png")
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=DOTS_PER_INCH)
+    figure.savefig(path, dpi=dots_per_inch)
     return path

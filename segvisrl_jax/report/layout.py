@@ -42,3 +42,4 @@ class DrivenPath:
     label: str
     xy_m: Float[np.ndarray, "T 2"]
     outcome: Outcome = Outcome.RUNNING
+    duration_s: float | None = None

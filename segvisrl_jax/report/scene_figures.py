@@ -4,10 +4,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Patch
+from matplotlib.ticker import MultipleLocator
 
 from segvisrl_jax.report import layout
 from segvisrl_jax.report.figures import DOTS_PER_INCH, cycle_colours, save_figure
@@ -24,6 +25,9 @@ OUTCOME_MARKERS = {
     Outcome.UNSTABLE: "P",
 }
 PANELS_IN_ROW = 3
+MARGIN_M = 0.8  # around all that was driven
+TICK_M = 5.0
+X_LABEL, Y_LABEL = "x, forward from the start [m]", "y, to the left [m]"
 
 
 def trajectories(scene: SceneMap, paths: Sequence[DrivenPath], path_png: Path, title: str = "") -> Path:
@@ -37,24 +41,29 @@ def trajectories(scene: SceneMap, paths: Sequence[DrivenPath], path_png: Path, t
     """
     figure = Figure(figsize=(10.5, 8), layout="compressed")
     axes = figure.add_subplot()
-    _draw_scene(axes, scene)
+    draw_scene(axes, scene)
     for path, colour in zip(paths, cycle_colours(layout.PATHS, len(paths)), strict=True):
-        label = f"{path.label}: {layout.OUTCOME_NAMES[path.outcome]}"
-        axes.plot(*path.xy_m.T, color=colour, lw=2, zorder=4)
-        marker = OUTCOME_MARKERS[path.outcome]
-        size = 15 if marker == "*" else 10
-        end = path.xy_m[-1]
-        axes.plot(*end, marker, color=colour, ms=size, mec="white", mew=1, zorder=6)
-        axes.plot([], [], marker=marker, ms=size * 0.8, mec="white", color=colour, lw=2, label=label)
+        draw_path(axes, path, colour)
     reach = scene.map_half_size_m * 1.04
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
-    axes.set(xlabel="x, forward from the start [m]", ylabel="y, to the left [m]")
+    axes.set(xlabel=X_LABEL, ylabel=Y_LABEL)
     axes.set_title(title, fontsize=13)
     figure.legend(loc="outside right upper", frameon=False)
     return save_figure(figure, path_png)
 
 
-def _draw_scene(axes: Axes, scene: SceneMap) -> None:
+def draw_path(axes: Axes, path: DrivenPath, colour: str, line_style: str = "-") -> None:
+    """A driven path with a marker that says how it ended, and a legend entry that names both."""
+    axes.plot(*path.xy_m.T, color=colour, lw=2, ls=line_style, zorder=4)
+    marker = OUTCOME_MARKERS[path.outcome]
+    size = 15 if marker == "*" else 10
+    axes.plot(*path.xy_m[-1], marker, color=colour, ms=size, mec="white", mew=1, zorder=6)
+    label = f"{path.label}: {layout.OUTCOME_NAMES[path.outcome]}"
+    label += "" if path.duration_s is None else f", {path.duration_s:.0f} s"
+    axes.plot([], [], marker=marker, ms=size * 0.8, mec="white", color=colour, lw=2, ls=line_style, label=label)
+
+
+def draw_scene(axes: Axes, scene: SceneMap) -> None:
     """Everything that does not move, with one legend entry for each kind."""
     half = scene.map_half_size_m
     axes.fill([-half, half, half, -half], [-half, -half, half, half], color="#f4f2ee", ec="0.4")
@@ -82,6 +91,35 @@ def _draw_scene(axes: Axes, scene: SceneMap) -> None:
             )
         )
     axes.plot(*scene.start_xy_m, "ko", ms=7, mfc="white", mew=1.5, zorder=5, label="start", ls="")
+
+
+def map_windows(
+    scenes: Sequence[SceneMap], driven: Sequence[Sequence[Float[np.ndarray, "T 2"]]]
+) -> tuple[list[Float[np.ndarray, "2"]], float]:
+    """The middle of where there is driving in each scene, and the side of the square that holds any of it.
+
+    Args:
+        scenes: K maps.
+        driven: the paths in each, as points. The goals are shown too.
+    """
+    middles, sides = [], []
+    for scene, paths in zip(scenes, driven, strict=True):
+        goal = scene.goal_xy_m + np.array([[-1.0], [1.0]]) * scene.goal_radius_m
+        points = np.concatenate([goal, *paths])
+        low, high = points.min(axis=0), points.max(axis=0)
+        middles.append((low + high) / 2)
+        sides.append(float((high - low).max()))
+    side = max(sides) + 2 * MARGIN_M
+    inside = [max(0.0, scene.map_half_size_m + MARGIN_M - side / 2) for scene in scenes]  # little beyond the map
+    return [np.clip(middle, -most, most) for middle, most in zip(middles, inside, strict=True)], side
+
+
+def cut_map(axes: Axes, middle: Float[np.ndarray, "2"], side: float) -> None:
+    """Shows a square of the map, with a tick every 5 m."""
+    left, bottom = middle - side / 2
+    axes.set(xlim=(left, left + side), ylim=(bottom, bottom + side), aspect="equal")
+    axes.xaxis.set_major_locator(MultipleLocator(TICK_M))
+    axes.yaxis.set_major_locator(MultipleLocator(TICK_M))
 
 
 def preprocessing(
