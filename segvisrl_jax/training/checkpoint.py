@@ -4,6 +4,7 @@ A checkpoint holds everything: parameters, optimizer, environments, memory, keys
 ``policy.json`` (configuration, scores) and ``params.npz``; loading either runs no code from the file.
 """
 
+import dataclasses
 import json
 import os
 from pathlib import Path
@@ -36,7 +37,7 @@ class Checkpoints:
         """Writes a pytree of arrays and keys, and JSON data that lives on the host."""
         if updates == self.latest:
             return
-        args = ocp.args.Composite(state=ocp.args.StandardSave(_without_keys(state)), host=ocp.args.JsonSave(host))
+        args = ocp.args.Composite(state=ocp.args.StandardSave(_stored(state)), host=ocp.args.JsonSave(host))
         self._manager.save(updates, args=args)
 
     def restore_latest(self, like: Any) -> tuple[Any, dict[str, Any]]:
@@ -55,7 +56,7 @@ class Checkpoints:
         Raises:
             ConfigError: where the checkpoint does not fit, as one of another architecture does not.
         """
-        target = jax.tree.map(ocp.utils.to_shape_dtype_struct, _without_keys(like))
+        target = jax.tree.map(ocp.utils.to_shape_dtype_struct, _stored(like))
         args = ocp.args.Composite(state=ocp.args.StandardRestore(target), host=ocp.args.JsonRestore())
         try:
             found = self._manager.restore(updates, args=args)
@@ -64,7 +65,7 @@ class Checkpoints:
             raise ConfigError(
                 f"checkpoint {self._manager.directory}/{updates} does not fit these settings: {reason}"
             ) from None
-        return _with_keys(found["state"], like), found["host"]
+        return _restored(found["state"], like), found["host"]
 
     def close(self) -> None:
         """Waits for writes and lets go of the folder."""
@@ -75,15 +76,38 @@ def _is_key(leaf: Any) -> bool:
     return hasattr(leaf, "dtype") and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def _without_keys(tree: Any) -> Any:
+def _stored(tree: Any) -> Any:
+    """What is written: keys as numbers, dataclasses as dicts of those fields that hold anything.
+
+    So a field that the settings leave empty leaves no trace, and runs from before there was such a field go on.
+    """
+    if dataclasses.is_dataclass(tree):
+        fields = {f.name: getattr(tree, f.name) for f in dataclasses.fields(tree)}
+        return {name: _stored(value) for name, value in fields.items() if not _is_left_out(value)}
     return jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, tree)
 
 
-def _with_keys(arrays: Any, like: Any) -> Any:
+def _is_left_out(value: Any) -> bool:
+    return value is None or (dataclasses.is_dataclass(value) and not jax.tree.leaves(value))
+
+
+def _restored(stored: Any, like: Any) -> Any:
+    """The inverse of ``_stored``."""
+    if dataclasses.is_dataclass(like):
+        fields = {name: _restored(value, getattr(like, name)) for name, value in stored.items()}
+        return dataclasses.replace(like, **fields)  # type: ignore[type-var]
+
     def restore(array: Any, leaf: Any) -> Any:
         return jax.random.wrap_key_data(array) if _is_key(leaf) else array
 
-    return jax.tree.map(restore, arrays, like)
+    return jax.tree.map(restore, stored, like)
+
+
+def _without_folders(config: TrainConfig) -> TrainConfig:
+    """The settings without the folders of the machine that trained; a policy to start from keeps its run's name."""
+    source = Path(config.start_from)
+    name = source.parent.name if source.name == "policy" else source.name
+    return dataclasses.replace(config, runs_dir=TrainConfig.runs_dir, start_from=name)
 
 
 def save_policy(folder: Path, config: TrainConfig, params: Any, scores: dict[str, Any]) -> None:
@@ -91,7 +115,7 @@ def save_policy(folder: Path, config: TrainConfig, params: Any, scores: dict[str
     folder.mkdir(parents=True, exist_ok=True)
     flat = {"/".join(path): np.asarray(leaf) for path, leaf in _leaves(jax.device_get(params))}
     _replace(folder / "params.npz", lambda file: np.savez(file, **flat))  # type: ignore[arg-type]
-    card = {"format": POLICY_FORMAT, "config": to_dict(config), "scores": scores}
+    card = {"format": POLICY_FORMAT, "config": to_dict(_without_folders(config)), "scores": scores}
     text = json.dumps(card, indent=2) + "\n"
     _replace(folder / "policy.json", lambda file: file.write(text.encode()))
 

@@ -12,12 +12,21 @@ import jax
 import numpy as np
 from flax import struct
 
-from segvisrl_jax.agent.networks import Network, make_network
+from segvisrl_jax.agent.networks import Network, Params, make_network
 from segvisrl_jax.agent.ppo import Learner, LearnerState, make_learner
-from segvisrl_jax.config import ConfigError, EnvConfig, TrainConfig, flatten, replace_fields, to_dict
-from segvisrl_jax.env.rover_env import RoverEnv
+from segvisrl_jax.config import (
+    ConditionsConfig,
+    ConfigError,
+    EnvConfig,
+    TrainConfig,
+    flatten,
+    replace_fields,
+    require,
+    to_dict,
+)
+from segvisrl_jax.env.rover_env import RoverEnv, observation_shape
 from segvisrl_jax.env.wrappers import VALIDATION_STREAM, BatchEnv, scene_stream
-from segvisrl_jax.training.checkpoint import Checkpoints, save_policy
+from segvisrl_jax.training.checkpoint import Checkpoints, load_policy, save_policy
 from segvisrl_jax.training.evaluation import Evaluator, summarize
 from segvisrl_jax.training.metrics import MetricsWriter, ProgressDisplay
 from segvisrl_jax.training.policy import Policy, network_policy
@@ -72,11 +81,13 @@ class Trainer:
         self.evaluator = Evaluator(RoverEnv(held_out_env(config.env)), self.policy, config.evaluation.num_slots)
         self._unroll = jax.jit(self._unroll_batch)
 
-    def start(self) -> TrainingState:
-        """The state before the first update."""
+    def start(self, params: Params | None = None) -> TrainingState:
+        """The state before the first update, with random weights where none are given."""
         keys = jax.random.split(jax.random.key(self.config.seed), 3)
         params_key, act_key, update_key = keys
         learner = jax.jit(self.learner.init)(params_key)
+        if params is not None:
+            learner = dataclasses.replace(learner, params=jax.tree.map(jax.numpy.asarray, params))
         actor = jax.jit(lambda key: start_acting(key, self.batch, self.network))(act_key)
         return TrainingState(learner, actor, update_key)
 
@@ -102,8 +113,10 @@ class Trainer:
 
 
 def held_out_env(config: EnvConfig) -> EnvConfig:
-    """The same world with the paper's start, all the rocks and no margin, whatever training is made of."""
-    return replace_fields(config, random_start_yaw_share=0.0, random_num_rocks=False, collision_margin_m=0.0)
+    """The same world with the paper's start, ``num_rocks`` rocks, no margin and neutral conditions, whatever training
+    is made of."""
+    neutral = {"random_start_yaw_share": 0.0, "random_num_rocks_max": 0, "collision_margin_m": 0.0}
+    return replace_fields(config, conditions=ConditionsConfig(), **neutral)
 
 
 def train(config: TrainConfig, say=print) -> TrainResult:
@@ -112,12 +125,14 @@ def train(config: TrainConfig, say=print) -> TrainResult:
     Writes config.json, metrics.jsonl, TensorBoard events, checkpoints/ and policy/ (the best one) to the run folder.
 
     Raises:
-        ConfigError: where the run folder exists and is not to be resumed, or cannot be.
+        ConfigError: where the run folder exists and is not to be resumed, or cannot be; where the policy to start from
+            is of another architecture, or sees something else.
     """
+    first_params = _params_to_start_from(config)
     run_dir = open_run_dir(config)
     trainer = Trainer(config)
     checkpoints = Checkpoints(run_dir)
-    state, host = trainer.start(), HostState()
+    state, host = trainer.start(first_params), HostState()
     if config.resume:
         state, data = checkpoints.restore_latest(state)
         host = HostState(**data)
@@ -131,6 +146,19 @@ def train(config: TrainConfig, say=print) -> TrainResult:
         checkpoints.close()
     done = host.updates * config.ppo.decisions_per_update
     return TrainResult(run_dir, host.updates >= config.num_updates, done, host.seconds)
+
+
+def _params_to_start_from(config: TrainConfig) -> Params | None:
+    if not config.start_from or config.resume:
+        return None
+    source, params, _ = load_policy(Path(config.start_from))
+    for name, ours, theirs in (
+        ("arch", config.arch, source.arch),
+        ("network", config.network, source.network),
+        ("observations", observation_shape(config.env), observation_shape(source.env)),
+    ):
+        require(ours == theirs, "start_from", config.start_from, f"a policy whose {name} is {ours}, not {theirs}")
+    return params
 
 
 @dataclasses.dataclass
@@ -217,8 +245,9 @@ def open_run_dir(config: TrainConfig) -> Path:
 
 
 def _require_same_run(config: TrainConfig, before: dict[str, Any], run_dir: Path) -> None:
-    """Only the number of steps and bookkeeping may change when a run goes on."""
-    now, then = flatten(json.loads(json.dumps(to_dict(config)))), flatten(before)
+    """Only the number of steps and bookkeeping may change when a run goes on. Conditions were neutral where unsaid."""
+    now = flatten(json.loads(json.dumps(to_dict(config))))
+    then = flatten({"env": {"conditions": to_dict(ConditionsConfig())}}) | flatten(before)
     for name, value in now.items():
         if name.split(".")[0] not in FREE_ON_RESUME and value != then.get(name):
             raise ConfigError(f"{name} = {value!r}: should be {then.get(name)!r}, as when {run_dir} was started")

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 
 from segvisrl_jax.config import ConfigError, TrainConfig, from_dict, preset_config, to_dict
 from segvisrl_jax.training.checkpoint import Checkpoints, load_policy, save_policy
@@ -38,6 +39,30 @@ def test_a_checkpoint_of_another_shape_is_refused(tmp_path):
     other = {**state(), "params": {"v": jnp.zeros(5)}}
     with pytest.raises(ConfigError, match="does not fit"):
         checkpoints.restore(1, other)
+    checkpoints.close()
+
+
+@struct.dataclass
+class Parts:
+    """A state of which some parts may be left out."""
+
+    always: jax.Array
+    sometimes: jax.Array | None = None
+    inner: "Parts | None" = None
+
+
+def test_what_is_left_out_leaves_no_trace_in_a_checkpoint(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    for updates, saved in ((1, {"always": jnp.ones(2)}), (2, Parts(jnp.ones(2), inner=Parts(jnp.zeros(3))))):
+        checkpoints.save(updates, saved, {})
+    first, _ = checkpoints.restore(1, Parts(jnp.zeros(2)))
+    assert isinstance(first, Parts)
+    np.testing.assert_array_equal(first.always, np.ones(2))
+    assert first.sometimes is first.inner is None
+    second, _ = checkpoints.restore(2, Parts(jnp.zeros(2), inner=Parts(jnp.ones(3))))
+    np.testing.assert_array_equal(second.inner.always, np.zeros(3))
+    with pytest.raises(ConfigError, match="does not fit"):
+        checkpoints.restore(1, Parts(jnp.zeros(2), sometimes=jnp.zeros(2)))
     checkpoints.close()
 
 

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from segvisrl_jax.config import ConfigError, preset_config, replace_fields
+from segvisrl_jax.config import ConditionsConfig, ConfigError, preset_config, replace_fields
 from segvisrl_jax.training import loop
 from segvisrl_jax.training.checkpoint import Checkpoints, load_policy
 from segvisrl_jax.training.metrics import read_metrics
@@ -81,6 +81,33 @@ def stop_after(config, updates):
         loop.Trainer.update = original
 
 
+def test_training_starts_from_a_policy_where_one_is_named(tmp_path):
+    config = tiny("mlp", tmp_path, updates=2, run="first")
+    loop.train(config, **QUIET)
+    policy = str(tmp_path / "first" / "policy")
+    _, params, _ = load_policy(loop.Path(policy))
+    more = replace_fields(config, start_from=policy, run="second", learning_rate=1e-9)
+    loop.train(more, **QUIET)
+    again, moved, _ = load_policy(tmp_path / "second" / "policy")
+    for a, b in zip(as_arrays(params), as_arrays(moved), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+    assert again.start_from == "first"  # its name, and no folder of this machine
+    assert again.runs_dir == "runs"
+
+
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [({"mlp_sizes": (9,)}, "network"), ({"scale": 60.0}, "observations"), ({"start_from": "nowhere"}, "policy.json")],
+)
+def test_a_policy_that_does_not_fit_is_refused_before_anything_is_made(field, message, tmp_path):
+    config = tiny("cnn_lstm", tmp_path, updates=2, run="first")
+    loop.train(config, **QUIET)
+    more = replace_fields(config, **{"start_from": str(tmp_path / "first" / "policy"), "run": "second"} | field)
+    with pytest.raises(ConfigError, match=message):
+        loop.train(more, **QUIET)
+    assert not (tmp_path / "second").exists()
+
+
 def test_a_run_leaves_its_files(tmp_path):
     config = tiny("mlp", tmp_path, updates=2, run="run")
     result = loop.train(config, **QUIET)
@@ -91,7 +118,7 @@ def test_a_run_leaves_its_files(tmp_path):
     assert {"evaluation/success", "evaluation/success_low", "evaluation/success_high"} <= set(lines[-1])
     assert list((tmp_path / "run" / "tensorboard").glob("events.*"))
     stored, params, scores = load_policy(tmp_path / "run" / "policy")
-    assert stored == config
+    assert stored == replace_fields(config, runs_dir="runs")  # names no folder of this machine
     assert scores["episodes"] == 4
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
 
@@ -120,6 +147,20 @@ def test_a_run_goes_on_only_as_itself(change, says, tmp_path):
         loop.train(replace_fields(config, resume=True, steps=64, **change), **QUIET)
 
 
+def test_a_run_from_before_there_were_conditions_goes_on(tmp_path):
+    """Such a run's settings do not name them, and its checkpoint has no place for them."""
+    config = tiny("mlp", tmp_path, updates=1, run="run")
+    loop.train(config, **QUIET)
+    file = tmp_path / "run" / "config.json"
+    settings = json.loads(file.read_text())
+    del settings["env"]["conditions"]
+    file.write_text(json.dumps(settings))
+    going_on = replace_fields(config, resume=True, steps=64)
+    with pytest.raises(ConfigError, match=r"env\.conditions\.left_wheel_gain = 0.5: should be 1.0"):
+        loop.train(replace_fields(going_on, left_wheel_gain=0.5), **QUIET)
+    assert loop.train(going_on, **QUIET).decisions == 64
+
+
 def test_nothing_to_resume_is_said(tmp_path):
     with pytest.raises(ConfigError, match="no checkpoint to resume"):
         loop.train(tiny("mlp", tmp_path, updates=1, run="none", resume=True), **QUIET)
@@ -138,6 +179,8 @@ def test_evaluation_starts_as_the_paper_does_whatever_training_does():
     config = preset_config("cnn_lstm", "cpu")
     assert config.env.scene.random_start_yaw_share > 0
     assert loop.held_out_env(config.env).scene.random_start_yaw_share == 0
+    shifted = replace_fields(config.env, randomize=True, latency_s=0.2)
+    assert loop.held_out_env(shifted) == loop.held_out_env(config.env)
 
 
 def test_the_nearest_rocks_are_learnt_from():
@@ -150,6 +193,20 @@ def test_the_nearest_rocks_are_learnt_from():
     moved = np.any(np.asarray(first_layers[0]) != np.asarray(first_layers[1]), axis=1)
     assert moved.shape == (31,)
     assert moved[:10].all()  # the state and the nearest rock; there are 4 rocks, and not all are ever near
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arch", ["cnn_lstm", "cnn_lstm_raw"])
+def test_randomised_conditions_are_learnt_under_and_redrawn_alike(arch, tmp_path):
+    """Frames drawn again from kept poses are those that were seen: the update is the same, but for rounding."""
+    losses = []
+    for redraw in (False, True):
+        config = tiny(arch, tmp_path, updates=1, randomize=True, latency_s=0.2, redraw_observations=redraw)
+        trainer = loop.Trainer(config)
+        assert trainer.evaluator.env.config.conditions == ConditionsConfig()
+        _, metrics, _ = trainer.update(trainer.start())
+        losses.append([float(metrics[name]) for name in ("policy_loss", "value_loss", "entropy")])
+    np.testing.assert_allclose(*losses, rtol=1e-3, atol=1e-5)
 
 
 @pytest.mark.gl
