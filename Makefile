@@ -10,6 +10,7 @@ STEPS ?=
 RUN ?=
 ARGS ?=
 EPISODES ?= 1000
+WORKERS ?= 2
 
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
@@ -58,17 +59,17 @@ sweep: $(READY) ## train over scales, architectures and seeds: a table and a plo
 bench: $(READY) ## measure physics, rendering and learning on this machine
 	@$(BIN)/segvisrl bench $(ARGS)
 
-test: $(READY) ## the whole suite, on the CPU
-	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest $(ARGS)
+test: $(READY) ## the whole suite, on the CPU, in WORKERS processes
+	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -n $(WORKERS) $(ARGS)
 
 test-fast: $(READY) ## the edit loop: everything but the slow tests
-	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -m "not slow" $(ARGS)
+	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -n $(WORKERS) -m "not slow" $(ARGS)
 
 check: $(READY) ## format, lint, types, fast tests
 	@$(BIN)/ruff format --check .
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy
-	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -q -m "not slow"
+	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -q -n $(WORKERS) -m "not slow"
 
 format: $(READY) ## rewrite the code in the project's format
 	@$(BIN)/ruff format .
