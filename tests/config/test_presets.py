@@ -1,0 +1,47 @@
+"""Presets hold what they say: the paper's table, and training scenes that differ from the held-out ones."""
+
+import pytest
+
+from segvisrl_jax.config import ConfigError, preset_config, replace_fields
+from segvisrl_jax.training.loop import held_out_env
+
+ARCHS = ["cnn_lstm", "cnn", "cnn_lstm_raw", "mlp", "mlp_rocks"]
+
+
+def test_the_papers_preset_is_its_table():
+    config = preset_config("cnn_lstm", "paper")
+    ppo = config.ppo
+    assert (config.steps, ppo.num_envs, ppo.unroll_length, ppo.num_minibatches, ppo.num_epochs) == (5e6, 1, 64, 1, 4)
+    assert (ppo.learning_rate, ppo.final_learning_rate_share, ppo.discount, ppo.gae_lambda) == (3e-4, 1, 0.85, 0.95)
+    assert (ppo.clip_epsilon, ppo.entropy_cost, ppo.value_cost, ppo.max_gradient_norm) == (0.2, 0.01, 0.5, 0.5)
+    assert (ppo.reward_scale, ppo.kl_stop, ppo.kl_target) == (1, 0, 0)
+    assert config.env == held_out_env(config.env)  # it trains in the world that it is judged in
+    assert config.env.camera.observation_size_px == (108, 192)
+
+
+@pytest.mark.parametrize("preset", ["cpu", "gpu"])
+@pytest.mark.parametrize("arch", ARCHS)
+def test_held_out_scenes_are_the_papers_whatever_training_is_made_of(arch, preset):
+    config = preset_config(arch, preset)
+    paper = preset_config(arch, "paper").env
+    judged = held_out_env(config.env)
+    assert judged == replace_fields(paper, scale=config.env.camera.scale)
+    assert config.env.scene.random_start_yaw_share > 0
+
+
+@pytest.mark.parametrize("preset", ["cpu", "gpu"])
+def test_only_who_sees_rocks_trains_among_many(preset):
+    rocks = {arch: preset_config(arch, preset).env.scene.random_num_rocks_max for arch in ARCHS}
+    assert rocks.pop("mlp") == 0
+    assert set(rocks.values()) == {32}
+
+
+def test_most_rocks_must_fit_and_have_shapes():
+    with pytest.raises(ConfigError, match=r"scene\.random_num_rocks_max = 65: should be at most num_rock_shapes = 64"):
+        replace_fields(preset_config("mlp", "smoke"), random_num_rocks_max=65)
+    with pytest.raises(ConfigError, match=r"scene\.random_num_rocks_max = -1: should be 0 or more"):
+        replace_fields(preset_config("mlp", "smoke"), random_num_rocks_max=-1)
+    narrow = {"map_size_m": 14.0, "goal_distance_max_m": 12.0, "rock_start_clearance_m": 7.5}
+    large = {"rock_radius_min_m": 0.45, "rock_radius_max_m": 0.45, "num_rocks": 0, "random_num_rocks_max": 9}
+    with pytest.raises(ConfigError, match=r"scene\.random_num_rocks_max = 9: .*without overlap"):
+        replace_fields(preset_config("mlp", "smoke"), **narrow, **large)
