@@ -87,7 +87,14 @@ def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: O
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise ConfigError(_one_line(said.getvalue())) from None
+        raise _config_error(stop) or ConfigError(_one_line(said.getvalue())) from None
+
+
+def _config_error(error: BaseException | None) -> ConfigError | None:
+    """The settings' own complaint behind tyro's exit, if that is the cause: tyro would break a long path in two."""
+    while error is not None and not isinstance(error, ConfigError):
+        error = error.__context__
+    return error
 
 
 def _whole_number(word: str) -> str:
@@ -106,8 +113,7 @@ def _one_line(message: str) -> str:
             break
         if line:
             paragraph.append(line)
-    text = " ".join(paragraph)
-    return re.sub(r"^Error parsing (env|ppo|network|evaluation|conditions)[\w.]*: ", "", text)
+    return " ".join(paragraph)
 
 
 def _usage() -> str:
