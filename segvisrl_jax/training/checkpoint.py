@@ -88,7 +88,12 @@ def _stored(tree: Any) -> Any:
 
 
 def _is_left_out(value: Any) -> bool:
-    return value is None or (dataclasses.is_dataclass(value) and not jax.tree.leaves(value))
+    """Whether it holds nothing: orbax refuses arrays without elements, as the rocks of a map without rocks are."""
+    return (
+        value is None
+        or (dataclasses.is_dataclass(value) and not jax.tree.leaves(value))
+        or (isinstance(value, jax.Array) and value.size == 0)
+    )
 
 
 def _restored(stored: Any, like: Any) -> Any:

@@ -66,6 +66,15 @@ def test_what_is_left_out_leaves_no_trace_in_a_checkpoint(tmp_path):
     checkpoints.close()
 
 
+def test_a_map_without_rocks_can_be_saved(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, Parts(jnp.ones(2), sometimes=jnp.zeros((4, 0, 2))), {})
+    found, _ = checkpoints.restore(1, Parts(jnp.zeros(2), sometimes=jnp.zeros((4, 0, 2))))
+    np.testing.assert_array_equal(found.always, np.ones(2))
+    assert found.sometimes.shape == (4, 0, 2)
+    checkpoints.close()
+
+
 def test_policies_come_back_bit_by_bit(tmp_path):
     config = preset_config("cnn_lstm", "cpu")
     params = {
