@@ -1,8 +1,8 @@
 """Settings of a training run: network, PPO, evaluation, and all of it together."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-from segvisrl_jax.config.checks import require, require_choice, require_finite_numbers
+from segvisrl_jax.config.checks import ConfigError, require, require_choice, require_finite_numbers
 from segvisrl_jax.config.environment import EnvConfig
 from segvisrl_jax.config.names import ARCH_OBSERVATION, Arch, PresetName
 
@@ -116,6 +116,8 @@ class EvaluationConfig:
     """Episodes of each."""
     num_slots: int = 64
     """Episodes that are driven at the same time; the scenes are the same for any number."""
+    rocks: int | None = None
+    """Rocks on the map; None: as many as env.scene.num_rocks. Where all policies reach every goal, none is the best."""
 
     def __post_init__(self) -> None:
         p = "evaluation"
@@ -123,6 +125,7 @@ class EvaluationConfig:
         require(self.every_decisions >= 1, f"{p}.every_decisions", self.every_decisions, "1 or more")
         require(1 <= self.episodes <= 10**7, f"{p}.episodes", self.episodes, "in [1, 10000000]")
         require(1 <= self.num_slots <= 10**5, f"{p}.num_slots", self.num_slots, "in [1, 100000]")
+        require(self.rocks is None or self.rocks >= 0, f"{p}.rocks", self.rocks, "0 or more, or None")
 
 
 @dataclass(frozen=True)
@@ -176,5 +179,16 @@ class TrainConfig:
             isinstance(self.run, str) and "/" not in self.run and self.run not in (".", "..") and "\0" not in self.run
         )
         require(is_plain, "run", self.run, "a folder's name without slashes")
+        self._require_room_for_validation_rocks()
         seen = ARCH_OBSERVATION[self.arch]
         require(self.env.obs == seen, "env.obs", self.env.obs, f"{seen} for arch {self.arch}")
+
+    def _require_room_for_validation_rocks(self) -> None:
+        rocks = self.evaluation.rocks
+        if rocks is None:
+            return
+        try:
+            replace(self.env.scene, num_rocks=rocks)
+        except ConfigError as error:
+            should = str(error).partition(": ")[2]
+            raise ConfigError(f"evaluation.rocks = {rocks!r}: {should}") from None

@@ -14,6 +14,7 @@ _TUNED: dict[str, Any] = {
     "random_num_rocks_max": 32,  # a rock is in the way in 4 % of the scenes with 4 rocks, in 32 % with 32
     "collision_margin_m": 0.15,  # collisions that are left are near misses
     "learning_rate": 5e-4,  # 1e-3 learns as fast and swings by 15 points from one evaluation to the next
+    "rocks": 32,  # of validation scenes: with 4, policies that differ with 16 all reach 99 to 100 %
     "kl_target": 0.025,  # late in training the same rate moves the policy farther, as its deviation falls
 }
 _PRESETS: dict[str, dict[str, Any]] = {
@@ -73,11 +74,16 @@ _CPU_STATE: dict[str, Any] = {
     "mlp_sizes": (256, 256),
     "every_decisions": 262_144,
 }
+# Without memory it must keep turning the same way until the goal is in view; at the map's edge it learns to turn back.
+_CNN: dict[str, Any] = {"close_goal_share": 0.5}
+_NO_ROCKS: dict[str, Any] = {"random_num_rocks_max": 0, "collision_margin_m": 0.0, "rocks": None}
 _BY_ARCH: dict[tuple[str, str], dict[str, Any]] = {
+    ("cpu", "cnn"): _CNN,
+    ("gpu", "cnn"): _CNN,
     ("cpu", "mlp_rocks"): _CPU_STATE,
     # It sees no rocks, so that more of them, or wider ones, would only be noise.
-    ("cpu", "mlp"): _CPU_STATE | {"random_num_rocks_max": 0, "collision_margin_m": 0.0},
-    ("gpu", "mlp"): {"random_num_rocks_max": 0, "collision_margin_m": 0.0},
+    ("cpu", "mlp"): _CPU_STATE | _NO_ROCKS,
+    ("gpu", "mlp"): _NO_ROCKS,
 }
 
 

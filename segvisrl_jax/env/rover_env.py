@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from brax.envs.base import Env, State
-from jaxtyping import Array, Bool, Int32, PRNGKeyArray, Shaped, UInt8, UInt32
+from jaxtyping import Array, Bool, Float32, Int32, PRNGKeyArray, Shaped, UInt8, UInt32
 
 from segvisrl_jax.config import IMAGE_OBSERVATIONS, EngineName, EnvConfig, ObservationKind, RendererName, replace_fields
 from segvisrl_jax.env import model, rocks, task
@@ -141,7 +141,7 @@ class RoverEnv(Env):
 
     def state_on(self, scene: Scene) -> RoverState:
         """The start of an episode on a given scene, under the scene's own conditions. Unbatched."""
-        start = jnp.asarray(self.config.scene.start_xy_m, jnp.float32)
+        start = self.start_xy_m(scene)
         clearance = task.rock_clearance_m(start[None], scene)[0]
         physics = self.engine.place(start, scene.start_yaw_rad)
         return RoverState(
@@ -154,6 +154,11 @@ class RoverEnv(Env):
             episode_return=jnp.float32(0.0),
             **first_memory(physics, scene),  # type: ignore[arg-type]
         )
+
+    def start_xy_m(self, scene: Scene) -> Float32[Array, "2"]:
+        """Where an episode on a scene starts, world frame. Unbatched."""
+        own = self.config.scene.start_xy_m if scene.start_xy_m is None else scene.start_xy_m
+        return jnp.asarray(own, jnp.float32)
 
     def advance(self, state: RoverState, action: Action) -> tuple[RoverState, StepResult]:
         """One decision of physics and task, without looking. Unbatched.

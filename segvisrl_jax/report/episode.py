@@ -154,7 +154,7 @@ def scene_map(env: RoverEnv, episode: Episode) -> SceneMap:
     """The episode's scene from above."""
     scene = episode.state(0).scene
     return SceneMap(
-        start_xy_m=np.asarray(env.config.scene.start_xy_m),
+        start_xy_m=np.asarray(env.start_xy_m(scene)),
         goal_xy_m=np.asarray(scene.goal_xy_m),
         rock_xy_m=np.asarray(scene.rock_xy_m),
         rock_radius_m=env.rocks.radius_m[scene.rock_shape],

@@ -78,7 +78,7 @@ class Trainer:
         self.learner: Learner = make_learner(self.network, config.ppo, config.num_updates, draw=draw)
         self.batch = BatchEnv(env, config.ppo.num_envs)
         self.policy: Policy = network_policy(self.network, config.arch)
-        self.evaluator = Evaluator(RoverEnv(held_out_env(config.env)), self.policy, config.evaluation.num_slots)
+        self.evaluator = Evaluator(RoverEnv(validation_env(config)), self.policy, config.evaluation.num_slots)
         self._unroll = jax.jit(self._unroll_batch)
 
     def start(self, params: Params | None = None) -> TrainingState:
@@ -113,10 +113,23 @@ class Trainer:
 
 
 def held_out_env(config: EnvConfig) -> EnvConfig:
-    """The same world with the paper's start, ``num_rocks`` rocks, no margin and neutral conditions, whatever training
-    is made of."""
-    neutral = {"random_start_yaw_share": 0.0, "random_num_rocks_max": 0, "collision_margin_m": 0.0}
+    """The same world with the paper's start and goals, ``num_rocks`` rocks, no margin and neutral conditions.
+
+    So it is whatever training is made of.
+    """
+    neutral = {
+        "random_start_yaw_share": 0.0,
+        "close_goal_share": 0.0,
+        "random_num_rocks_max": 0,
+        "collision_margin_m": 0.0,
+    }
     return replace_fields(config, conditions=ConditionsConfig(), **neutral)
+
+
+def validation_env(config: TrainConfig) -> EnvConfig:
+    """The held-out world with the validation scenes' number of rocks."""
+    env, rocks = held_out_env(config.env), config.evaluation.rocks
+    return env if rocks is None else replace_fields(env, num_rocks=rocks)
 
 
 def train(config: TrainConfig, say=print) -> TrainResult:

@@ -3,7 +3,7 @@
 import pytest
 
 from segvisrl_jax.config import ConfigError, preset_config, replace_fields
-from segvisrl_jax.training.loop import held_out_env
+from segvisrl_jax.training.loop import held_out_env, validation_env
 
 ARCHS = ["cnn_lstm", "cnn", "cnn_lstm_raw", "mlp", "mlp_rocks"]
 
@@ -34,6 +34,27 @@ def test_only_who_sees_rocks_trains_among_many(preset):
     rocks = {arch: preset_config(arch, preset).env.scene.random_num_rocks_max for arch in ARCHS}
     assert rocks.pop("mlp") == 0
     assert set(rocks.values()) == {32}
+
+
+def test_validation_scenes_tell_policies_apart_that_see_rocks():
+    cnn_lstm, mlp = (preset_config(arch, "cpu") for arch in ("cnn_lstm", "mlp"))
+    assert validation_env(cnn_lstm) == replace_fields(held_out_env(cnn_lstm.env), num_rocks=32)
+    assert validation_env(mlp) == held_out_env(mlp.env)
+    assert validation_env(mlp).scene.num_rocks == 4
+
+
+@pytest.mark.parametrize(
+    ("rocks", "says"), [(70, "should be at most num_rock_shapes = 64"), (-1, "should be 0 or more, or None")]
+)
+def test_validation_rocks_must_fit(rocks, says):
+    with pytest.raises(ConfigError, match=rf"evaluation\.rocks = {rocks}: {says}"):
+        replace_fields(preset_config("cnn", "cpu"), rocks=rocks)
+
+
+def test_without_memory_close_goals_teach_to_search():
+    shares = {arch: preset_config(arch, "cpu").env.scene.close_goal_share for arch in ARCHS}
+    assert shares.pop("cnn") > 0
+    assert set(shares.values()) == {0}
 
 
 def test_most_rocks_must_fit_and_have_shapes():
