@@ -14,7 +14,7 @@ import numpy as np
 import tyro
 
 from segvisrl_jax.cli import parse
-from segvisrl_jax.config import ConfigError, EnvConfig, TaskConfig, from_dict, require
+from segvisrl_jax.config import ConfigError, EnvConfig, TaskConfig, TrainConfig, from_dict, require
 from segvisrl_jax.report.table import Evaluation, results_table
 from segvisrl_jax.training.statistics import wilson_interval
 
@@ -92,6 +92,7 @@ def _evaluation(file: str, data: dict[str, Any]) -> Evaluation:
         require(type(training["steps"]) is int, "training_config.steps", training["steps"], "a whole number")
         require(bool(training["preset"]), "training_config.preset", training["preset"], "a name")
         require(type(data["training_seed"]) is int, "training_seed", data["training_seed"], "a whole number")
+        from_dict(TrainConfig, training)  # refuses settings that this version does not have
     return Evaluation(
         file=file,
         method=_text(data, "method"),

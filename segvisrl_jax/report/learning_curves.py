@@ -18,18 +18,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from segvisrl_jax.config import ConfigError, TrainConfig, flatten, from_dict, require, to_dict
+from segvisrl_jax.config import ConfigError, TrainConfig, from_dict, require
 from segvisrl_jax.report.figures import SHARP_DOTS_PER_INCH, clear_frame, save_figure
 from segvisrl_jax.report.lines import BAND_ALPHA, LineEnd, method_colours, name_ends
+from segvisrl_jax.report.recipe import recipe
 from segvisrl_jax.training.metrics import METRICS_FILE, STEP_KEY, read_metrics
 
 POINTS = 200  # of a run's return at most: more than a figure can show
 LOG_FROM = 4.0  # the longest run over the shortest, from which on decisions are on a logarithmic axis
 RETURN_KEY, SUCCESS_KEY = "episode/return", "evaluation/success"
 COLUMNS = ("arch", "recipe", "run", "seed", "decisions", "return", "success")
-NOT_THE_RECIPE = ("seed", "run", "runs_dir", "resume", "checkpoint_every_updates", "evaluation")
-NOT_THE_RECIPE_OF_ENV = ("env.renderer", "env.physics.engine", "env.physics.num_threads")
-"""Settings in which two runs of one method may differ: bookkeeping, and who computes what is the same."""
 
 
 class Series(NamedTuple):
@@ -98,9 +96,7 @@ def _run_curve(run_dir: Path) -> Curve:
 
 def _recipe(config: TrainConfig) -> str:
     """A digest of all settings that make the method."""
-    kept = {name: value for name, value in to_dict(config).items() if name not in NOT_THE_RECIPE}
-    settings = {name: value for name, value in flatten(kept).items() if name not in NOT_THE_RECIPE_OF_ENV}
-    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
+    return hashlib.sha256(json.dumps(recipe(config), sort_keys=True).encode()).hexdigest()[:8]
 
 
 def _series(rows: Sequence[dict[str, Any]], key: str) -> Series:

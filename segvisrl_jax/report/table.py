@@ -12,14 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from segvisrl_jax.config import EnvConfig, SceneConfig, flatten
+from segvisrl_jax.config import EnvConfig, SceneConfig, TrainConfig, from_dict
+from segvisrl_jax.report.recipe import recipe
 from segvisrl_jax.training.statistics import mcnemar, wilson_interval
 
 NONE = "-"
 PAPER_TRIALS = 30
 P_TOO_SMALL = 1e-15  # below it a p-value's digits say nothing
-NOT_THE_METHOD = ("seed", "checkpoint_every_updates")
-"""Settings of a training run that do not make another method of it."""
 NAMES = {"p": "P controller", "random": "random controller"}
 
 
@@ -90,11 +89,12 @@ class Evaluation:
     @property
     def variant(self) -> tuple[Any, ...]:
         """What makes two evaluations comparable as two training seeds of one method."""
-        recipe = None
-        if self.training_config is not None:
-            settings = flatten(self.training_config)
-            recipe = json.dumps({k: v for k, v in settings.items() if k not in NOT_THE_METHOD}, sort_keys=True)
-        return (self.method, self.physics, self.renderer, self.image, recipe)
+        return (self.method, self.physics, self.renderer, self.image, json.dumps(self.recipe, sort_keys=True))
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """Settings of the training that make the method (``recipe.recipe``); nothing for a controller."""
+        return recipe(from_dict(TrainConfig, self.training_config)) if self.training_config else {}
 
 
 VARIANT_COLUMNS: dict[str, Callable[[Evaluation], str | None]] = {

@@ -1,0 +1,17 @@
+"""What of a training run's settings makes the method."""
+
+from typing import Any
+
+from segvisrl_jax.config import TrainConfig, flatten, to_dict
+
+BOOKKEEPING = ("seed", "run", "runs_dir", "resume", "checkpoint_every_updates", "evaluation")
+WHO_COMPUTES = ("env.renderer", "env.physics.engine", "env.physics.num_threads")
+
+
+def recipe(config: TrainConfig) -> dict[str, Any]:
+    """Settings by their full names, equal for two runs of one method with different seeds.
+
+    Seed, bookkeeping and the choice of the best policy are left out, and who computes what is the same.
+    """
+    kept = {name: value for name, value in to_dict(config).items() if name not in BOOKKEEPING}
+    return {name: value for name, value in flatten(kept).items() if name not in WHO_COMPUTES}

@@ -1,0 +1,26 @@
+"""Two runs of one method with different seeds have one recipe; whatever changes what is learnt makes another."""
+
+import pytest
+
+from segvisrl_jax.config import preset_config, replace_fields
+from segvisrl_jax.report.recipe import recipe
+
+CONFIG = preset_config("cnn_lstm", "cpu")
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"seed": 3},
+        {"run": "other", "runs_dir": "elsewhere"},
+        {"rocks": None, "episodes": 10},
+        {"engine": "native", "num_threads": 2, "renderer": "gl"},
+    ],
+)
+def test_bookkeeping_makes_no_other_method(changed):
+    assert recipe(replace_fields(CONFIG, **changed)) == recipe(CONFIG)
+
+
+@pytest.mark.parametrize("changed", [{"learning_rate": 1e-3}, {"steps": 1000}, {"scale": 20.0}, {"num_rocks": 8}])
+def test_what_is_learnt_from_does(changed):
+    assert recipe(replace_fields(CONFIG, **changed)) != recipe(CONFIG)
