@@ -21,6 +21,7 @@ from matplotlib.transforms import ScaledTranslation, Transform
 from segvisrl_jax.config import CameraConfig, ConfigError, flatten, require, to_dict
 from segvisrl_jax.report.figures import SHARP_DOTS_PER_INCH, clear_frame, save_figure
 from segvisrl_jax.report.lines import BAND_ALPHA, POINTS_PER_INCH, LineEnd, method_colours, name_ends
+from segvisrl_jax.report.recipe import WHO_COMPUTES
 from segvisrl_jax.report.table import NAMES, Evaluation
 
 CEILING = "planner"
@@ -125,7 +126,8 @@ def _world(evaluation: Evaluation) -> dict[str, Any]:
 
 def _method_key(evaluation: Evaluation, field: str) -> str:
     """Equal for evaluations that belong on one line."""
-    ours = {name: value for name, value in _settings(evaluation).items() if name != field}
+    not_ours = (field, *(name.removeprefix("env.") for name in WHO_COMPUTES))
+    ours = {name: value for name, value in _settings(evaluation).items() if name not in not_ours}
     recipe = {name: value for name, value in evaluation.recipe.items() if name != f"env.{field}"}
     return json.dumps([evaluation.method, evaluation.engine, evaluation.renderer, ours, recipe], sort_keys=True)
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from segvisrl_jax.config import preset_config, replace_fields
-from segvisrl_jax.report.recipe import recipe
+from segvisrl_jax.config import flatten, preset_config, replace_fields, to_dict
+from segvisrl_jax.report.recipe import WHO_COMPUTES, recipe
 
 CONFIG = preset_config("cnn_lstm", "cpu")
 
@@ -24,3 +24,7 @@ def test_bookkeeping_makes_no_other_method(changed):
 @pytest.mark.parametrize("changed", [{"learning_rate": 1e-3}, {"steps": 1000}, {"scale": 20.0}, {"num_rocks": 8}])
 def test_what_is_learnt_from_does(changed):
     assert recipe(replace_fields(CONFIG, **changed)) != recipe(CONFIG)
+
+
+def test_who_computes_are_settings_that_exist():
+    assert set(WHO_COMPUTES) <= flatten(to_dict(CONFIG)).keys()
