@@ -16,7 +16,7 @@ def require(condition: bool, name: str, value: object, should: str) -> None:
 
 
 def require_finite_numbers(part: Any, prefix: str) -> None:
-    """Every float of a config part is a finite real number, every int an int, every bool a bool."""
+    """Floats of a config part are finite real numbers, ints are ints (or None where that may be), bools are bools."""
     for f in dataclasses.fields(part):
         value = getattr(part, f.name)
         name = f"{prefix}.{f.name}"
@@ -25,6 +25,9 @@ def require_finite_numbers(part: Any, prefix: str) -> None:
             require(is_number and math.isfinite(value), name, value, "a finite number")
         elif f.type in (int, "int"):
             require(isinstance(value, int) and not isinstance(value, bool), name, value, "a whole number")
+        elif f.type in (int | None, "int | None"):
+            is_whole = value is None or (isinstance(value, int) and not isinstance(value, bool))
+            require(is_whole, name, value, "a whole number, or None")
         elif f.type in (bool, "bool"):
             require(isinstance(value, bool), name, value, "True or False")
 

@@ -44,10 +44,15 @@ def test_validation_scenes_tell_policies_apart_that_see_rocks():
 
 
 @pytest.mark.parametrize(
-    ("rocks", "says"), [(70, "should be at most num_rock_shapes = 64"), (-1, "should be 0 or more, or None")]
+    ("rocks", "says"),
+    [
+        (70, "should be at most num_rock_shapes = 64"),
+        (-1, "should be 0 or more, or None"),
+        *((wrong, "should be a whole number, or None") for wrong in ("x", 2.5, True)),
+    ],
 )
 def test_validation_rocks_must_fit(rocks, says):
-    with pytest.raises(ConfigError, match=rf"evaluation\.rocks = {rocks}: {says}"):
+    with pytest.raises(ConfigError, match=rf"evaluation\.rocks = {rocks!r}: {says}"):
         replace_fields(preset_config("cnn", "cpu"), rocks=rocks)
 
 
