@@ -313,6 +313,18 @@ def test_engine_that_cannot_run_says_why(monkeypatch: pytest.MonkeyPatch) -> Non
         make_engine(EnvConfig(physics=PhysicsConfig(engine="mjx")))
 
 
+@pytest.mark.parametrize(
+    ("text", "reason"), [("no such contact\nmore", "no such contact"), ("", "NotImplementedError")]
+)
+def test_what_mjx_refuses_is_said_in_one_line(text: str, reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise NotImplementedError(text)
+
+    monkeypatch.setattr("mujoco.mjx.put_model", refuse)
+    with pytest.raises(ConfigError, match=rf"because MJX cannot run: {reason}$"):
+        make_engine(EnvConfig(physics=PhysicsConfig(engine="mjx")))
+
+
 FRESH_PROCESS = """
 import jax
 from segvisrl_jax.config import EnvConfig

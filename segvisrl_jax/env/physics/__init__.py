@@ -36,7 +36,7 @@ def _make_mjx(config: EnvConfig) -> PhysicsEngine:
 
         return MjxEngine(config)
     except (ImportError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0]
+        reason = next(iter(str(error).splitlines()), type(error).__name__)  # not every error has a text
         raise ConfigError(
             f"physics.engine = 'mjx': should be 'native' here, because MJX cannot run: {reason}"
         ) from error
