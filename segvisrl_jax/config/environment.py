@@ -22,7 +22,8 @@ class SceneConfig:
     """Share of episodes that start with a uniformly random heading (ours; 0 is the paper's start)."""
     close_goal_share: float = 0.0
     """Share of episodes that start in the middle of the map, facing anywhere, with the goal 2 to 8 m away (ours; 0 is
-    the paper's start). It teaches to turn until the goal is in view, which at the edge of the map is dangerous."""
+    the paper's start). It teaches to turn until the goal is in view, which at the edge of the map is dangerous. In
+    training it falls to nothing (close_goals_until)."""
     goal_distance_min_m: float = 10.0
     """The goal is uniform over the map, at least this far from the start (paper)."""
     goal_distance_max_m: float = 16.0

@@ -148,6 +148,9 @@ class TrainConfig:
     """Go on from the run folder's last checkpoint."""
     start_from: str = ""
     """A policy's folder, or a shipped policy's name: training starts from its weights. Empty: from random ones."""
+    close_goals_until: float = 0.5
+    """The share of training scenes with a close goal (env.scene.close_goal_share) falls linearly, to nothing after this
+    share of the training."""
     checkpoint_every_updates: int = 8
     env: EnvConfig = field(default_factory=EnvConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
@@ -175,6 +178,9 @@ class TrainConfig:
         require(
             self.checkpoint_every_updates >= 1, "checkpoint_every_updates", self.checkpoint_every_updates, "1 or more"
         )
+        until = self.close_goals_until
+        is_share = type(until) in (int, float) and 0 < until <= 1
+        require(is_share, "close_goals_until", until, "a number in (0, 1]")
         is_plain = (
             isinstance(self.run, str) and "/" not in self.run and self.run not in (".", "..") and "\0" not in self.run
         )

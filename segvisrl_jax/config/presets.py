@@ -75,7 +75,7 @@ _CPU_STATE: dict[str, Any] = {
     "every_decisions": 262_144,
 }
 # Without memory it must keep turning the same way until the goal is in view; at the map's edge it learns to turn back.
-_CNN: dict[str, Any] = {"close_goal_share": 0.5}
+_CNN: dict[str, Any] = {"close_goal_share": 1.0}
 _NO_ROCKS: dict[str, Any] = {"random_num_rocks_max": 0, "collision_margin_m": 0.0, "rocks": None}
 _BY_ARCH: dict[tuple[str, str], dict[str, Any]] = {
     ("cpu", "cnn"): _CNN,

@@ -134,9 +134,9 @@ class RoverEnv(Env):
 
     # the parts that training composes in its own order
 
-    def initial_state(self, key: PRNGKeyArray) -> RoverState:
-        """The start of an episode on a scene drawn from the key, without looking at it. Unbatched."""
-        scene = sample_scene(key, self.config.scene, self.rocks)
+    def initial_state(self, key: PRNGKeyArray, close_goal_share: Float32[Array, ""] | None = None) -> RoverState:
+        """The start of an episode on a scene drawn from the key (``sample_scene``), not looked at. Unbatched."""
+        scene = sample_scene(key, self.config.scene, self.rocks, close_goal_share)
         return self.state_on(with_conditions(key, scene, self.config))
 
     def state_on(self, scene: Scene) -> RoverState:

@@ -18,13 +18,19 @@ from segvisrl_jax.types import ConvexSolids, Scene
 FAR_AWAY_M = 1e4  # where a rock stands that has not been placed, or not yet: it keeps nothing clear
 
 
-def sample_scene(key: PRNGKeyArray, config: SceneConfig, rocks: ConvexSolids) -> Scene:
+def sample_scene(
+    key: PRNGKeyArray,
+    config: SceneConfig,
+    rocks: ConvexSolids,
+    close_goal_share: Float32[Array, ""] | None = None,
+) -> Scene:
     """Draws one scene.
 
     Args:
         key: one PRNG key.
         config: the rules.
         rocks: the rock library (``env.rocks.rock_library(config)``).
+        close_goal_share: in place of the settings' share, where that is above 0 (training lets it fall).
 
     Returns:
         A scene with ``config.most_rocks`` rocks: the goal uniform over the part of the map between the least and the
@@ -33,7 +39,7 @@ def sample_scene(key: PRNGKeyArray, config: SceneConfig, rocks: ConvexSolids) ->
         stands far outside the map. With ``close_goal_share``, some scenes have their start in the middle of the map.
     """
     goal_key, shape_key, place_key, yaw_key, start_key = jax.random.split(key, 5)
-    start = _sample_start(start_key, config)
+    start = _sample_start(start_key, config, close_goal_share)
     goal_xy = _sample_goal(goal_key, config, start)
     shape = jax.random.permutation(shape_key, config.num_rock_shapes)[: config.most_rocks]
     shape = shape.astype(jnp.int32)
@@ -70,7 +76,7 @@ class _Start(NamedTuple):
     goal_distance_max_m: float | Float32[Array, ""]
 
 
-def _sample_start(key: PRNGKeyArray, config: SceneConfig) -> _Start:
+def _sample_start(key: PRNGKeyArray, config: SceneConfig, close_goal_share: Float32[Array, ""] | None) -> _Start:
     """The settings' start, facing inwards (0) or anywhere; or the middle of the map, facing anywhere."""
     yaw = _sample_start_yaw(key, config.random_start_yaw_share)
     start = jnp.asarray(config.start_xy_m, jnp.float32)
@@ -79,7 +85,8 @@ def _sample_start(key: PRNGKeyArray, config: SceneConfig) -> _Start:
         return usual
     choice_key, yaw_key = jax.random.split(jax.random.fold_in(key, 1))
     close = _Start(jnp.zeros(2), _uniform_yaw(yaw_key), CLOSE_GOAL_MIN_M, CLOSE_GOAL_MAX_M)
-    is_close = jax.random.uniform(choice_key, ()) < config.close_goal_share
+    share = config.close_goal_share if close_goal_share is None else close_goal_share
+    is_close = jax.random.uniform(choice_key, ()) < share
     return jax.tree.map(lambda a, b: jnp.where(is_close, jnp.float32(a), jnp.float32(b)), close, usual)
 
 

@@ -28,6 +28,7 @@ class BatchState:
     rover: RoverState
     key: Key[Array, "B"]  # each environment draws its scenes from its own key
     is_first: Float32[Array, "B"]  # 1 where the episode begins with the next decision
+    close_goal_share: Float32[Array, ""] | None = None  # of scenes to come, in place of the settings'
 
 
 @struct.dataclass
@@ -59,7 +60,7 @@ class BatchEnv:
     def reset(self, key: PRNGKeyArray) -> BatchState:
         """B fresh episodes."""
         keys = jax.random.split(key, self.num_envs)
-        rover, next_keys = jax.vmap(self._fresh)(keys)
+        rover, next_keys = self._fresh(keys)
         return BatchState(rover, next_keys, jnp.ones(self.num_envs, jnp.float32))
 
     def step(self, state: BatchState, action: Action) -> tuple[BatchState, BatchStep]:
@@ -76,19 +77,24 @@ class BatchEnv:
             rover=rover,
         )
         done = step.done > 0
-        after = BatchState(rover, state.key, step.done)
+        after = dataclasses.replace(state, rover=rover, is_first=step.done)
         return jax.lax.cond(jnp.any(done), self._reset_where, lambda _, s: s, done, after), step
 
     def observe(self, state: BatchState) -> Observation:
         """What every agent sees now, (B, ...)."""
         return jax.vmap(self.env.observe)(state.rover)
 
-    def _fresh(self, key: PRNGKeyArray) -> tuple[RoverState, PRNGKeyArray]:
-        scene_key, next_key = jax.random.split(key)
-        return self.env.initial_state(scene_key), next_key
+    def _fresh(
+        self, keys: Key[Array, "B"], close_goal_share: Float32[Array, ""] | None = None
+    ) -> tuple[RoverState, Key[Array, "B"]]:
+        def draw(key: PRNGKeyArray) -> tuple[RoverState, PRNGKeyArray]:
+            scene_key, next_key = jax.random.split(key)
+            return self.env.initial_state(scene_key, close_goal_share), next_key
+
+        return jax.vmap(draw)(keys)
 
     def _reset_where(self, done: Array, state: BatchState) -> BatchState:
-        fresh, next_keys = jax.vmap(self._fresh)(state.key)
+        fresh, next_keys = self._fresh(state.key, state.close_goal_share)
         rover = select(done, fresh, state.rover)
         return dataclasses.replace(state, rover=rover, key=jnp.where(done, next_keys, state.key))
 

@@ -66,6 +66,12 @@ class Evaluation:
         return np.array([kind == "success" for kind in self.outcome])
 
     @property
+    def goal_in_view(self) -> Bool[np.ndarray, "E"]:
+        """Whether each episode's goal is in the camera's field of view at the start."""
+        bearings = np.array(self.numbers["per_episode"]["goal_bearing_deg"], np.float64)
+        return np.abs(bearings) <= self.config.camera.horizontal_fov_deg / 2
+
+    @property
     def physics(self) -> str:
         """Engine and time step."""
         return f"{self.engine}, {1000 * self.config.physics.timestep_s:g} ms"
@@ -164,9 +170,10 @@ def _differs(values) -> bool:
 
 
 LEGEND = f"""\
-Success, collision, fall and timeout are in per cent of the scenes; in brackets are Wilson 95 % intervals. SPL is
-success weighted by path length, and the path ratio is driven over shortest path (of successes), both against the exact
-shortest path around the rocks. Time is the mean of successes; clearance is the least distance to a rock's centre in any
+Success, collision, fall and timeout are in per cent of the scenes; in brackets are Wilson 95 % intervals. Beside them
+is the success where the goal is in the camera's view at the start, and where it is not. SPL is success weighted by path
+length, and the path ratio is driven over shortest path (of successes), both against the exact shortest path around the
+rocks. Time is the mean of successes; clearance is the least distance to a rock's centre in any
 episode. A method that was trained with several seeds is shown by its median seed (of an even number, the lower of the
 two in the middle): every number in its row is of that one policy, and the worst seed stands beside it. p is McNemar's
 exact test, two-sided and not corrected for the number of rows, of success against the P controller scene by scene;
@@ -200,6 +207,7 @@ def section_table(section: Sequence[Evaluation], shown: Sequence[str] = ()) -> s
 TITLES = {
     "success": "success [95 %]",
     "worst": "worst seed [95 %]",
+    "in view": "goal in view : out of view",
     "time": "time (s)",
     "clearance": "clearance (m)",
     "mcnemar": "p against P (only it : only P)",
@@ -223,6 +231,7 @@ def _columns(rows: Sequence[Row], shown: Sequence[str], baselines: Sequence[Eval
     shares += ["unstable"] if any(row.median.numbers["unstable"] for row in rows) else []
     for name in shares:
         columns[name] = lambda row, name=name: f"{100 * row.median.numbers[name]:.1f}"  # type: ignore[misc]
+    columns["in view"] = _in_view_cell
     columns["SPL"] = lambda row: _number(row, "spl", 3)
     columns["path ratio"] = lambda row: _number(row, "path_ratio", 3)
     columns["time"] = lambda row: _number(row, "mean_time_s", 1)
@@ -261,6 +270,12 @@ def _worst_cell(row: Row) -> str:
     if len(row.seeds) == 1:
         return NONE
     return f"{_success_cell(row.worst)} (seed {row.worst.training_seed})"
+
+
+def _in_view_cell(row: Row) -> str:
+    evaluation = row.median
+    groups = (evaluation.succeeded[evaluation.goal_in_view == is_seen] for is_seen in (True, False))
+    return " : ".join(f"{100 * np.mean(group):.1f}" if group.size else NONE for group in groups)
 
 
 def _number(row: Row, name: str, digits: int) -> str:

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Array, Float32, Int32
 
 from segvisrl_jax.agent.networks import Network, Params, make_network
 from segvisrl_jax.agent.ppo import Learner, LearnerState, make_learner
@@ -87,7 +89,7 @@ class Trainer:
         params_key, act_key, update_key = keys
         learner = jax.jit(self.learner.init)(params_key)
         if params is not None:
-            learner = dataclasses.replace(learner, params=jax.tree.map(jax.numpy.asarray, params))
+            learner = dataclasses.replace(learner, params=jax.tree.map(jnp.asarray, params))
         actor = jax.jit(lambda key: start_acting(key, self.batch, self.network))(act_key)
         return TrainingState(learner, actor, update_key)
 
@@ -100,7 +102,7 @@ class Trainer:
 
     def act(self, state: TrainingState):
         """One rollout: see ``rollout.unroll``."""
-        return self._unroll(state.learner.params, state.actor)
+        return self._unroll(state.learner, state.actor)
 
     def evaluate(self, params: Any) -> dict[str, Any]:
         """The current policy on the validation scenes."""
@@ -108,8 +110,19 @@ class Trainer:
         finished = self.evaluator.run(params, stream, self.config.evaluation.episodes)
         return summarize(finished, self.evaluator.env)
 
-    def _unroll_batch(self, params: Any, actor: ActorState):
-        return unroll(params, actor, self.batch, self.network, self.config.ppo)
+    def _unroll_batch(self, learner: LearnerState, actor: ActorState):
+        actor = _with_close_goals(actor, self._close_goal_share(learner.num_updates))
+        after, *found = unroll(learner.params, actor, self.batch, self.network, self.config.ppo)
+        return _with_close_goals(after, None), *found
+
+    def _close_goal_share(self, num_updates: Int32[Array, ""]) -> Float32[Array, ""] | None:
+        """Of the scenes drawn in the next rollout; None where there are none at any time."""
+        start, end = self.config.env.scene.close_goal_share, self.config.close_goals_until * self.config.num_updates
+        return None if start == 0 else start * jnp.maximum(1 - num_updates / end, 0)
+
+
+def _with_close_goals(actor: ActorState, share: Float32[Array, ""] | None) -> ActorState:
+    return dataclasses.replace(actor, env=dataclasses.replace(actor.env, close_goal_share=share))
 
 
 def held_out_env(config: EnvConfig) -> EnvConfig:
@@ -258,9 +271,10 @@ def open_run_dir(config: TrainConfig) -> Path:
 
 
 def _require_same_run(config: TrainConfig, before: dict[str, Any], run_dir: Path) -> None:
-    """Only the number of steps and bookkeeping may change when a run goes on. Conditions were neutral where unsaid."""
+    """Only the number of steps and bookkeeping may change when a run goes on. What old runs do not say is neutral."""
     now = flatten(json.loads(json.dumps(to_dict(config))))
-    then = flatten({"env": {"conditions": to_dict(ConditionsConfig())}}) | flatten(before)
+    unsaid = {"env": {"conditions": to_dict(ConditionsConfig())}, "close_goals_until": config.close_goals_until}
+    then = flatten(unsaid) | flatten(before)
     for name, value in now.items():
         if name.split(".")[0] not in FREE_ON_RESUME and value != then.get(name):
             raise ConfigError(f"{name} = {value!r}: should be {then.get(name)!r}, as when {run_dir} was started")

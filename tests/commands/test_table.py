@@ -97,6 +97,14 @@ def interval(share: float, bounds: list[float]) -> str:
     return f"{100 * share:.1f} [{100 * bounds[0]:.1f}, {100 * bounds[1]:.1f}]"
 
 
+def shares_by_view(data: dict) -> list[str]:
+    """Success in per cent of the scenes whose goal starts within the 69.4 degrees of the camera, and of the others."""
+    ended: dict[bool, list[bool]] = {True: [], False: []}
+    for bearing, outcome in zip(data["per_episode"]["goal_bearing_deg"], data["per_episode"]["outcome"], strict=True):
+        ended[abs(bearing) <= 34.7].append(outcome == "success")
+    return [f"{100 * sum(ended[seen]) / len(ended[seen]):.1f}" for seen in (True, False)]
+
+
 @pytest.mark.parametrize(("name", "title"), [("p", "P controller"), ("random", "random controller"), ("mlp", "mlp")])
 def test_the_numbers_of_a_row_are_those_of_the_file(folder, capsys, name, title):
     names = ("mlp",) if name == "mlp" else ("p", "random")
@@ -108,6 +116,7 @@ def test_the_numbers_of_a_row_are_those_of_the_file(folder, capsys, name, title)
     expected = {"SPL": ("spl", 3), "path ratio": ("path_ratio", 3), "time (s)": ("mean_time_s", 1)}
     for column, (key, digits) in {**expected, "clearance (m)": ("min_clearance_m", 3)}.items():
         assert row[column] == ("-" if data[key] is None else f"{data[key]:.{digits}f}")
+    assert row["goal in view : out of view"] == " : ".join(shares_by_view(data))
     first = data["per_episode"]["outcome"][:30]
     counts = "/".join(str(first.count(kind)) for kind in ("collision", "fall", "timeout"))
     trials = next(cell for column, cell in row.items() if column.startswith("first 30 scenes"))

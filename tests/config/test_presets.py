@@ -58,7 +58,7 @@ def test_validation_rocks_must_fit(rocks, says):
 
 def test_without_memory_close_goals_teach_to_search():
     shares = {arch: preset_config(arch, "cpu").env.scene.close_goal_share for arch in ARCHS}
-    assert shares.pop("cnn") > 0
+    assert shares.pop("cnn") == 1.0
     assert set(shares.values()) == {0}
 
 
