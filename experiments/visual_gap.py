@@ -9,7 +9,7 @@
 # cnn_lstm, 200 episodes, every kind, and docs/images/visual_gap.png. Writes visual_gap.png; beside it what every shift
 # looks like at its worst (visual_gap_views.png) and all numbers (visual_gap.json). What is in the JSON already is not
 # driven again: stopped, it goes on where it was. 200 episodes at one severity take one to three minutes on two cores at
-# scale 40; there are 50 severities for a policy that sees segmented images, and 68 for one that sees colour
+# scale 40; there are 54 severities for a policy that sees segmented images, and 72 for one that sees colour
 # (`--severities 1` drives the strongest of each alone).
 
 # %%
@@ -71,7 +71,7 @@ class Kind:
     @property
     def seen_by(self) -> Sequence[str]:
         """Observations to which it makes a difference."""
-        light, image = ("sun_elevation_deg", "sun_azimuth_deg"), ("horizontal_fov_deg", "rock_size")
+        light, image = ("sun_elevation_deg", "sun_azimuth_deg"), ("horizontal_fov_deg", "rock_size", "rock_shapes_seed")
         others = dict.fromkeys(light, ("rgb",)) | dict.fromkeys(image, IMAGE_OBSERVATIONS)
         return AFFECTS.get(self.setting) or others.get(self.setting, EVERYONE)
 
@@ -111,6 +111,7 @@ GROUPS = {
         Kind("camera_pitch_offset_deg", "Pitch of the camera", "degrees down", (-8, -4, 4, 8)),
         Kind("horizontal_fov_deg", "Field of view", "degrees", (50, 60, 80, 90)),
         Kind("rock_size", "Size of the rocks", "times", (0.5, 0.75, 1.25, 1.5)),
+        Kind("rock_shapes_seed", "Other rocks", "seed of the 64 shapes", (1, 2, 3, 4)),
     ),
     "Time and driving": (
         Kind("dropped_frame_share", "Frames lost", "share", (0.1, 0.25, 0.5, 0.75)),
