@@ -20,7 +20,7 @@ unexport JAX_PLATFORMS
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train eval baselines demo sweep bench table test test-fast check format lock clean
+.PHONY: help setup sb3 train eval baselines demo sweep bench table test test-fast check format lock clean
 
 help: ## this list
 	@echo "usage: make TARGET [ARCH=cnn_lstm|cnn|cnn_lstm_raw|mlp|mlp_rocks] [PRESET=auto|cpu|gpu|paper|smoke] [STEPS=] [SEED=] [RUN=] [ARGS=]"
@@ -36,6 +36,9 @@ $(READY): requirements.lock pyproject.toml
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
+
+sb3: $(READY) ## add Stable-Baselines3 and PyTorch (for a CPU: 0.9 GB) to .venv; its tests run from then on
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check torch==2.13.0 stable-baselines3==2.9.2 sb3-contrib==2.9.2
 
 train: $(READY) ## train ARCH with PRESET, evaluate it, write runs/<name>/
 	@$(BIN)/segvisrl train --arch $(ARCH) --preset $(PRESET) --seed $(SEED) $(if $(STEPS),--steps $(STEPS)) $(if $(RUN),--run $(RUN)) $(ARGS)

@@ -80,7 +80,7 @@ def work(asked: TrajectoriesOptions) -> None:
     print("|---" * (len(methods) + 1) + "|")
     for case in cases:
         print(f"| {case.title} | {' | '.join(end_of(method, case.scene) for method in methods)} |")
-    maps = [scene_map(envs[0], methods[0].episodes[case.scene]) for case in cases]
+    maps = [scene_map(envs[0], methods[0].episodes[case.scene].state(0).scene) for case in cases]
     print(draw_cases(cases, maps, methods, asked.output))
 
 

@@ -1,12 +1,16 @@
 """Visual-navigation reinforcement learning for a small lunar rover, on MuJoCo / MJX and JAX.
 
 ``make_env`` builds the environment; ``train`` trains a policy; ``load_policy`` reads a trained one. Names are imported
-when they are first used, so that importing the package is quick and touches no device.
+when they are first used, so that importing the package is quick and touches no device. Importing it also registers
+``segvisrl_jax/LunarRover-v0`` with Gymnasium.
 """
 
 import importlib
 from typing import Any
 
+import gymnasium
+
+GYMNASIUM_ID = "segvisrl_jax/LunarRover-v0"
 _PUBLIC = {
     "ConfigError": "segvisrl_jax.config",
     "EnvConfig": "segvisrl_jax.config",
@@ -19,6 +23,12 @@ _PUBLIC = {
     "train": "segvisrl_jax.training.loop",
 }
 __all__ = sorted(_PUBLIC)
+
+gymnasium.register(
+    id=GYMNASIUM_ID,
+    entry_point="segvisrl_jax.adapters.gymnasium:LunarRover",
+    vector_entry_point="segvisrl_jax.adapters.gymnasium:LunarRoverVector",
+)
 
 
 def __getattr__(name: str) -> Any:

@@ -17,6 +17,7 @@ MAY_IMPORT = {  # part -> the parts it may import, besides itself
     "agent": {"config", "types"},
     "training": {"assets", "config", "types", "env", "vision", "agent"},
     "report": {"config", "types", "env", "vision", "training"},
+    "adapters": {"config", "types", "env", "report"},
     "commands": {"assets", "config", "types", "env", "vision", "agent", "training", "report", "cli"},
     "cli": {"config", "commands"},
     "__init__": {"config", "env", "vision", "training"},

@@ -110,7 +110,7 @@ class ActorCritic(nn.Module):
         self.body = _make_body(self.arch, config)
         if has_memory(self.arch):
             self.memory = ResettableLSTM(config.lstm_size)
-        self.policy_head = _dense(ACTION_SIZE, POLICY_GAIN)
+        self.policy_head = _dense(ACTION_SIZE, POLICY_GAIN, _initial_bias(config))
         self.value_head = _dense(1, VALUE_GAIN)
         start = nn.initializers.constant(math.log(config.initial_std))
         self.log_std = self.param("log_std", start, (ACTION_SIZE,))
@@ -225,8 +225,15 @@ def _make_body(arch: Arch, config: NetworkConfig) -> MLP | ImpalaCNN:
     return MLP(config.mlp_sizes)
 
 
-def _dense(size: int, gain: float = HIDDEN_GAIN) -> nn.Dense:
-    return nn.Dense(size, kernel_init=nn.initializers.orthogonal(gain))
+def _initial_bias(config: NetworkConfig) -> nn.initializers.Initializer:
+    """Of the policy's head, so that left and right wheel begin ``initial_turn`` apart, around half speed."""
+    half = config.initial_turn / 2
+    free = math.atanh(half / HALF_RANGE) if config.bounded_mean else half
+    return lambda key, shape, dtype=jnp.float32: jnp.array([-free, free], dtype)
+
+
+def _dense(size: int, gain: float = HIDDEN_GAIN, bias: nn.initializers.Initializer = nn.initializers.zeros) -> nn.Dense:
+    return nn.Dense(size, kernel_init=nn.initializers.orthogonal(gain), bias_init=bias)
 
 
 def _convolution(channels: int, gain: float = HIDDEN_GAIN) -> nn.Conv:

@@ -25,6 +25,9 @@ class NetworkConfig:
     """The Gaussian's mean is squashed to the wheels' range [0, 1]; else it is free."""
     initial_std: float = 0.25
     """Standard deviation of the action at the start, as a share of the top speed."""
+    initial_turn: float = 0.0
+    """By how much the right wheel is faster than the left at the start, as a share of the top speed: above 0, a policy
+    turns left until it learns otherwise."""
 
     def __post_init__(self) -> None:
         p = "network"
@@ -37,6 +40,7 @@ class NetworkConfig:
         require(1 <= self.feature_size <= 8192, f"{p}.feature_size", self.feature_size, "in [1, 8192]")
         require(1 <= self.lstm_size <= 8192, f"{p}.lstm_size", self.lstm_size, "in [1, 8192]")
         require(0 < self.initial_std <= 10, f"{p}.initial_std", self.initial_std, "in (0, 10]")
+        require(-1 < self.initial_turn < 1, f"{p}.initial_turn", self.initial_turn, "in (-1, 1)")
 
 
 @dataclass(frozen=True)

@@ -266,6 +266,18 @@ def make_env(
     Raises:
         ConfigError: for a setting that does not exist or cannot be used.
     """
+    return RoverEnv(env_config(obs, scale, renderer, physics, num_rocks, **fields))
+
+
+def env_config(
+    obs: ObservationKind = "segmentation",
+    scale: float = 10,
+    renderer: RendererName = "auto",
+    physics: EngineName = "auto",
+    num_rocks: int = 4,
+    **fields: Any,
+) -> EnvConfig:
+    """The settings of ``make_env``, without building anything."""
     scale = float(scale) if isinstance(scale, int) else scale
     named: dict[str, Any] = {
         "obs": obs,
@@ -274,7 +286,7 @@ def make_env(
         "engine": physics,
         "num_rocks": num_rocks,
     }
-    return RoverEnv(replace_fields(EnvConfig(), **named, **fields))
+    return replace_fields(EnvConfig(), **named, **fields)
 
 
 def observation_shape(config: EnvConfig) -> tuple[int, ...]:

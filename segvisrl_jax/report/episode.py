@@ -14,10 +14,11 @@ from segvisrl_jax.config import ObservationKind, replace_fields
 from segvisrl_jax.env.pose import camera_mount, camera_pose, yaw_rad
 from segvisrl_jax.env.rover_env import RoverEnv
 from segvisrl_jax.env.wrappers import select
+from segvisrl_jax.report import layout
 from segvisrl_jax.report.layout import SceneMap
 from segvisrl_jax.report.video import Pane, compose_frame, top_view_frame
 from segvisrl_jax.training.policy import Policy
-from segvisrl_jax.types import Outcome, RoverState
+from segvisrl_jax.types import Outcome, RoverState, Scene
 from segvisrl_jax.vision.classes import PALETTE
 from segvisrl_jax.vision.renderer import make_renderer
 
@@ -126,38 +127,58 @@ def _episode(states: RoverState, place: int) -> Episode:
 
 def episode_frames(env: RoverEnv, episode: Episode, title: str = "") -> Iterator[UInt8[np.ndarray, "H W 3"]]:
     """The frames of an episode's video, one a decision, the last one held."""
-    segmented, coloured = (camera_view(env, kind) for kind in ("segmentation", "rgb"))
-    scene = scene_map(env, episode)
-    last = len(episode.xy_m) - 1
-    for step in range(last + 1):
-        rover = episode.state(step)
-        camera = [
-            Pane(np.asarray(coloured(rover)), "onboard camera"),
-            Pane(np.asarray(segmented(rover)), "segmentation"),
-        ]
-        if episode.observations is not None:
-            camera.append(Pane(episode.observations[step], observation_caption(env)))
-        heading = float(yaw_rad(rover.physics.qpos))
-        above = top_view_frame(scene, episode.xy_m[: step + 1], heading)
-        status = episode.outcome.name.lower() if step == last else "driving"
-        label = f"{title}   {step * env.dt:3.0f} s   {status}"
-        frame = compose_frame(
-            [camera, [Pane(above, "map, 25 m" if scene.map_half_size_m == 12.5 else "map")]],
-            title=label,
-        )
+    draw = EpisodeView(env)
+    for step in range(len(episode.xy_m)):
+        seen = None if episode.observations is None else episode.observations[step]
+        frame = draw(episode.state(step), episode.xy_m[: step + 1], seen, title)
         yield frame
     for _ in range(HOLD_FRAMES):
         yield frame
 
 
-def scene_map(env: RoverEnv, episode: Episode) -> SceneMap:
-    """The episode's scene from above."""
-    scene = episode.state(0).scene
+class EpisodeView:
+    """Draws one moment of an episode: onboard camera, segmentation, what the policy sees, the map with the trail."""
+
+    def __init__(self, env: RoverEnv) -> None:
+        self._env = env
+        self._segmented, self._coloured = (camera_view(env, kind) for kind in ("segmentation", "rgb"))
+
+    def __call__(
+        self,
+        rover: RoverState,
+        trail_xy_m: Float[np.ndarray, "T 2"],
+        observation: UInt8[np.ndarray, "H W 3"] | None,
+        title: str = "",
+    ) -> UInt8[np.ndarray, "H W 3"]:
+        """One frame.
+
+        Args:
+            rover: the state. Unbatched.
+            trail_xy_m: where the rover was so far; the last row is where it is.
+            observation: the policy's image; None leaves that pane out.
+            title: what stands before the time and the outcome.
+        """
+        camera = [
+            Pane(np.asarray(self._coloured(rover)), "onboard camera"),
+            Pane(np.asarray(self._segmented(rover)), "segmentation"),
+        ]
+        if observation is not None:
+            camera.append(Pane(observation, observation_caption(self._env)))
+        scene = scene_map(self._env, rover.scene)
+        above = top_view_frame(scene, trail_xy_m, float(yaw_rad(rover.physics.qpos)))
+        status = layout.OUTCOME_NAMES[Outcome(int(rover.outcome))]
+        label = f"{title}   {int(rover.num_decisions) * self._env.dt:3.0f} s   {status}"
+        size_m = 2 * scene.map_half_size_m
+        return compose_frame([camera, [Pane(above, f"map, {size_m:g} m")]], title=label.lstrip())
+
+
+def scene_map(env: RoverEnv, scene: Scene) -> SceneMap:
+    """A scene from above."""
     return SceneMap(
         start_xy_m=np.asarray(env.start_xy_m(scene)),
         goal_xy_m=np.asarray(scene.goal_xy_m),
         rock_xy_m=np.asarray(scene.rock_xy_m),
-        rock_radius_m=env.rocks.radius_m[scene.rock_shape],
+        rock_radius_m=env.rocks.radius_m[np.asarray(scene.rock_shape)],
         map_half_size_m=env.config.scene.map_size_m / 2,
         collision_radius_m=env.config.task.collision_radius_m,
         goal_radius_m=env.config.task.goal_radius_m,

@@ -106,7 +106,7 @@ def card_title(failure: Failure) -> str:
 
 def _draw_map(axes: Axes, env: RoverEnv, episode: Episode) -> None:
     """Where it drove, and where it looked at the end."""
-    scene = scene_map(env, episode)
+    scene = scene_map(env, episode.state(0).scene)
     (middle,), side = map_windows([scene], [[episode.xy_m]])
     draw_scene(axes, scene)
     draw_path(axes, DrivenPath("", episode.xy_m, episode.outcome), layout.PATHS[0])

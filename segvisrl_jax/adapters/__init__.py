@@ -1,0 +1,1 @@
+"""The environment in other libraries' terms: ``gymnasium`` and ``brax``."""
