@@ -18,9 +18,13 @@ COMMANDS = {
     "train": "train a policy, evaluate it, draw its learning curve and a video",
     "eval": "drive held-out scenes with a run, a policy or a controller, and report shares with intervals",
     "table": "compare evaluations on the same scenes: the results table, in markdown",
+    "report": "one self-contained HTML page about one or several runs",
     "demo": "let a policy drive one scene and write a video",
+    "export": "write a policy as a file that other programs can run: ONNX or StableHLO",
     "sweep": "train over scales, architectures and seeds; a table and a plot",
     "bench": "measure physics, rendering and learning on this machine",
+    "runs": "list the runs in a folder: how far they are, how well they drive",
+    "doctor": "say whether this machine can do the work, how fast, and what to mend",
 }
 USAGE_ERROR = 2
 INTERRUPTED = 130

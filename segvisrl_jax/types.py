@@ -59,7 +59,6 @@ class Scene:
     rock_shape: Int32[Array, "*B R"]  # row of the rock library; all different within a scene
     start_yaw_rad: Float32[Array, "*B"]  # the rover's heading at the start
     sun_direction: Float32[Array, "*B 3"]  # unit vector from the ground towards the sun
-    start_xy_m: Float32[Array, "*B 2"] | None = None  # where no scene differs from the settings' start: None
     conditions: Conditions = Conditions()
 
 

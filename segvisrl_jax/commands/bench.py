@@ -1,11 +1,8 @@
 """``segvisrl bench``: how fast physics, rendering and learning run on this machine."""
 
-import functools
 import json
 import platform
-import statistics
 import sys
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +23,6 @@ from segvisrl_jax.config import (
     require,
 )
 
-LEAST_TIMED_S = 0.1  # what is shorter is drowned in noise
 Part = Literal["physics", "render", "train"]
 PlainRenderer = Literal["scanline", "gl", "warp", "mujoco.Renderer"]
 """The project's renderers, and MuJoCo's Python class as one would use it without this project."""
@@ -101,39 +97,27 @@ def machine() -> dict[str, Any]:
 
 
 def _physics(asked: BenchOptions):
-    import jax
-    import jax.numpy as jnp
-
-    from segvisrl_jax.env.wrappers import BatchEnv
+    from segvisrl_jax.machine.speed import physics_row
 
     config = preset_config("mlp", asked.preset).env
-    steps = round(config.task.decision_dt_s / config.physics.timestep_s)
     for engine in asked.engines:
         env = _env_or_none(replace_fields(config, engine=engine))
-        if env is None:
-            continue
-        batch = BatchEnv(env, asked.batch)
-        state = jax.jit(batch.reset)(jax.random.key(0))
-        step, action = jax.jit(batch.step), jnp.full((asked.batch, 2), 0.7)
-        compile_s, seconds = _time(functools.partial(step, state, action), asked.repeats)
-        rate = asked.batch / seconds
-        yield {
-            "name": engine,
-            "batch": asked.batch,
-            "decisions_per_s": rate,
-            "mujoco_steps_per_s": rate * steps,
-            "compile_s": compile_s,
-        }
+        if env is not None:
+            yield {"name": engine, **physics_row(env, asked.batch, asked.repeats)}
 
 
 def _render(asked: BenchOptions):
     """Frames a second of each renderer on the same scenes, and the ratio to MuJoCo's through this project (gl)."""
+    from segvisrl_jax.machine.speed import render_row
+
     base = replace_fields(preset_config("cnn_lstm", asked.preset).env, scale=asked.scale)
     for num_rocks in asked.num_rocks:
         config = replace_fields(base, num_rocks=num_rocks)
         looks = {name: _look_or_none(name, config) for name in asked.renderers}
         for batch in asked.batches:
-            timed = [_render_row(name, look, config, batch, asked.repeats) for name, look in looks.items() if look]
+            timed = [
+                {"name": name, **render_row(look, config, batch, asked.repeats)} for name, look in looks.items() if look
+            ]
             reference = next((row["frames_per_s"] for row in timed if row["name"] == "gl"), None)
             for row in timed:
                 yield row if reference is None else {**row, "ratio_to_gl": row["frames_per_s"] / reference}
@@ -189,47 +173,15 @@ def _mujoco_look(config: EnvConfig) -> Callable[[Any], Any] | None:
     return look
 
 
-def _render_row(name: str, look: Callable[[Any], Any], config: EnvConfig, batch: int, repeats: int) -> dict[str, Any]:
-    import jax
-
-    from segvisrl_jax.env.rover_env import RoverEnv
-
-    scenes = RoverEnv(replace_fields(config, obs="state"))
-    states = jax.jit(jax.vmap(scenes.initial_state))(jax.random.split(jax.random.key(0), batch))
-    compile_s, seconds = _time(functools.partial(look, states), repeats)
-    rows, columns = config.camera.observation_size_px
-    image = f"{config.camera.width_px} x {config.camera.height_px} to {columns} x {rows}"
-    row = {"name": name, "image": image, "rocks": config.scene.num_rocks, "batch": batch}
-    return {**row, "frames_per_s": batch / seconds, "compile_s": compile_s}
-
-
 def _train(asked: BenchOptions):
     """Acting and learning; images kept from acting, or drawn again in every epoch."""
-    import jax
-
-    from segvisrl_jax.training.loop import Trainer
+    from segvisrl_jax.machine.speed import learning_row
 
     config = preset_config(asked.arch, asked.preset)
-    decisions = config.ppo.decisions_per_update
-    images = decisions * config.ppo.num_epochs
-    sees = config.env.obs in IMAGE_OBSERVATIONS
-    for redraw in (False, True) if sees else (False,):
-        trainer = Trainer(replace_fields(config, redraw_observations=redraw, kl_stop=0.0))
-        state = trainer.start()
-        _, trajectory, last_value, _ = trainer.act(state)
-        compile_act, act_s = _time(functools.partial(trainer.act, state), asked.repeats)
-        learn = functools.partial(trainer.learner.update, state.learner, trajectory, last_value, jax.random.key(0))
-        compile_learn, learn_s = _time(learn, asked.repeats)
-        kept = sum(leaf.nbytes for leaf in jax.tree.leaves(trajectory.observation))
-        yield {
-            "name": f"{asked.arch}, {asked.preset}",
-            "observations": "drawn again" if redraw else "kept",
-            "observation_mib": kept / 2**20,
-            "acting_decisions_per_s": decisions / act_s,
-            "gradient_images_per_s": images / learn_s,
-            "decisions_per_s": decisions / (act_s + learn_s),
-            "compile_s": compile_act + compile_learn,
-        }
+    for redraw in (False, True) if config.env.obs in IMAGE_OBSERVATIONS else (False,):
+        row = learning_row(replace_fields(config, redraw_observations=redraw), asked.repeats)
+        observations = "drawn again" if redraw else "kept"
+        yield {"name": f"{asked.arch}, {asked.preset}", "observations": observations, **row}
 
 
 def _env_or_none(config):
@@ -241,21 +193,6 @@ def _env_or_none(config):
     except ConfigError as error:
         print(f"left out: {error}", file=sys.stderr)
         return None
-
-
-def _time(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
-    """(seconds of the first call, median seconds of a call). Short calls are timed several at a time."""
-    import jax
-
-    def seconds(calls: int) -> float:
-        began = time.perf_counter()
-        for _ in range(calls):
-            jax.block_until_ready(call())
-        return (time.perf_counter() - began) / calls
-
-    first, second = seconds(1), seconds(1)
-    calls = max(1, round(LEAST_TIMED_S / second))
-    return first, statistics.median(seconds(calls) for _ in range(repeats))
 
 
 def _processor() -> str:

@@ -74,7 +74,7 @@ def read_evaluation(path: Path) -> Evaluation:
     try:
         data = json.loads(path.read_text())
         require(isinstance(data, dict), "content", type(data).__name__, "an object")
-        evaluation = _evaluation(str(path), data)
+        evaluation = evaluation_of(str(path), data)
         _require_numbers(data)
         _require_agreement(data)
     except KeyError as error:
@@ -85,7 +85,8 @@ def read_evaluation(path: Path) -> Evaluation:
     return evaluation
 
 
-def _evaluation(file: str, data: dict[str, Any]) -> Evaluation:
+def evaluation_of(file: str, data: dict[str, Any]) -> Evaluation:
+    """What ``segvisrl eval`` found, as the table takes it; ``file`` is what messages call it."""
     training = data["training_config"]
     if training is not None:
         require(isinstance(training, dict), "training_config", training, "an object or null")
@@ -194,11 +195,13 @@ def _require_same_scenes(first: Evaluation, other: Evaluation) -> None:
 
 def _rules(evaluation: Evaluation) -> dict[str, Any]:
     """Which scenes were driven, and by which rules."""
-    config = evaluation.config
+    return {"seed": evaluation.seed, "episodes": evaluation.episodes, **rules_of(evaluation.config)}
+
+
+def rules_of(config: EnvConfig) -> dict[str, Any]:
+    """Settings of a world that scenes and outcomes depend on: not the rewards, nor what computes."""
     task = [f.name for f in dataclasses.fields(TaskConfig) if f.name not in REWARDS]
     return {
-        "seed": evaluation.seed,
-        "episodes": evaluation.episodes,
         **{f"scene.{name}": value for name, value in dataclasses.asdict(config.scene).items()},
         **{f"conditions.{name}": value for name, value in dataclasses.asdict(config.conditions).items()},
         **{f"task.{name}": getattr(config.task, name) for name in task},

@@ -7,7 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from segvisrl_jax.cli import INTERRUPTED, parse
-from segvisrl_jax.config import IMAGE_OBSERVATIONS, ConfigError, TrainConfig, flatten, from_dict, preset_config, to_dict
+from segvisrl_jax.config import (
+    IMAGE_OBSERVATIONS,
+    ConfigError,
+    PresetName,
+    TrainConfig,
+    flatten,
+    from_dict,
+    preset_config,
+    to_dict,
+)
 
 TEST_EPISODES = 200  # driven after training, on scenes that neither training nor the choice of the policy saw
 
@@ -39,7 +48,7 @@ def parse_config(options: Sequence[str]) -> TrainConfig:
         if base is not None:
             return parse(TrainConfig, words, "train", base)
     if preset == "auto":
-        preset = _preset_for_this_machine()
+        preset = preset_for_this_machine()
         words = _without(words, "--preset")
     return parse(TrainConfig, words, "train", preset_config(arch, preset))
 
@@ -54,7 +63,8 @@ def _stored_config(runs_dir: str, run_name: str) -> TrainConfig | None:
         raise ConfigError(f"{file}: not a run's settings ({error})") from None
 
 
-def _preset_for_this_machine() -> str:
+def preset_for_this_machine() -> PresetName:
+    """What ``--preset auto`` takes: gpu where JAX has an accelerator, else cpu."""
     import jax
 
     from segvisrl_jax.env.physics.native import make_callbacks_safe
@@ -84,7 +94,7 @@ def differences_from_paper(config: TrainConfig) -> str:
     """One block: what of these settings is not the paper's."""
     paper = flatten(to_dict(preset_config(config.arch, "paper")))
     ours = flatten(to_dict(config))
-    bookkeeping = ("seed", "run", "runs_dir", "resume", "preset", "checkpoint_every_updates")
+    bookkeeping = ("seed", "run", "runs_dir", "resume", "preset", "checkpoint_every_updates", "loggers")
     rows = [
         f"  {name:<34} {_short(value):>12}   paper {_short(paper[name])}"
         for name, value in ours.items()

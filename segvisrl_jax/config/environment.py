@@ -7,8 +7,6 @@ from segvisrl_jax.config.checks import require, require_choice, require_divides,
 from segvisrl_jax.config.conditions import NEUTRAL, SCANLINE_ONLY, ConditionsConfig
 from segvisrl_jax.config.names import EngineName, ObservationKind, RendererName
 
-CLOSE_GOAL_MIN_M, CLOSE_GOAL_MAX_M = 2.0, 8.0  # distance of the goal where it is close (close_goal_share)
-
 
 @dataclass(frozen=True)
 class SceneConfig:
@@ -20,10 +18,6 @@ class SceneConfig:
     """Start: the middle of one end of the map, this far inside the edge, facing inwards (the inset is ours)."""
     random_start_yaw_share: float = 0.0
     """Share of episodes that start with a uniformly random heading (ours; 0 is the paper's start)."""
-    close_goal_share: float = 0.0
-    """Share of episodes that start in the middle of the map, facing anywhere, with the goal 2 to 8 m away (ours; 0 is
-    the paper's start). It teaches to turn until the goal is in view, which at the edge of the map is dangerous. In
-    training it falls to nothing (close_goals_until)."""
     goal_distance_min_m: float = 10.0
     """The goal is uniform over the map, at least this far from the start (paper)."""
     goal_distance_max_m: float = 16.0
@@ -66,11 +60,8 @@ class SceneConfig:
         half = self.map_size_m / 2
         require(0 < self.map_size_m <= 1000, f"{p}.map_size_m", self.map_size_m, "in (0, 1000] metres")
         require(0 <= self.start_inset_m < half, f"{p}.start_inset_m", self.start_inset_m, f"in [0, {half})")
-        for name in ("random_start_yaw_share", "close_goal_share"):
-            require(0 <= getattr(self, name) <= 1, f"{p}.{name}", getattr(self, name), "in [0, 1]")
-        has_room = self.close_goal_share == 0 or half >= CLOSE_GOAL_MAX_M
-        least = f"at least {2 * CLOSE_GOAL_MAX_M:g} metres with close_goal_share above 0"
-        require(has_room, f"{p}.map_size_m", self.map_size_m, least)
+        share = self.random_start_yaw_share
+        require(0 <= share <= 1, f"{p}.random_start_yaw_share", share, "in [0, 1]")
         low, high = self.goal_distance_min_m, self.goal_distance_max_m
         require(low > 0, f"{p}.goal_distance_min_m", low, "positive")
         require(high > low, f"{p}.goal_distance_max_m", high, f"more than goal_distance_min_m = {low}")

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 
 from segvisrl_jax.config.checks import ConfigError, require, require_choice, require_finite_numbers
 from segvisrl_jax.config.environment import EnvConfig
-from segvisrl_jax.config.names import ARCH_OBSERVATION, Arch, PresetName
+from segvisrl_jax.config.names import ARCH_OBSERVATION, Arch, LoggerName, PresetName
 
 
 @dataclass(frozen=True)
@@ -152,10 +152,10 @@ class TrainConfig:
     """Go on from the run folder's last checkpoint."""
     start_from: str = ""
     """A policy's folder, or a shipped policy's name: training starts from its weights. Empty: from random ones."""
-    close_goals_until: float = 0.5
-    """The share of training scenes with a close goal (env.scene.close_goal_share) falls linearly, to nothing after this
-    share of the training."""
     checkpoint_every_updates: int = 8
+    loggers: tuple[LoggerName, ...] = ()
+    """wandb, mlflow: who gets the numbers besides metrics.jsonl and TensorBoard. Offline, unless WANDB_MODE or
+    MLFLOW_TRACKING_URI say otherwise; each is an extra of the package."""
     env: EnvConfig = field(default_factory=EnvConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
@@ -174,6 +174,9 @@ class TrainConfig:
     def __post_init__(self) -> None:
         require_choice(self.arch, Arch, "arch")
         require_choice(self.preset, PresetName, "preset")
+        for logger in self.loggers:
+            require_choice(logger, LoggerName, "loggers")
+        require(len(set(self.loggers)) == len(self.loggers), "loggers", self.loggers, "each of them once")
         for name in ("seed", "steps", "checkpoint_every_updates"):
             value = getattr(self, name)
             require(type(value) is int, name, value, "a whole number")
@@ -182,9 +185,6 @@ class TrainConfig:
         require(
             self.checkpoint_every_updates >= 1, "checkpoint_every_updates", self.checkpoint_every_updates, "1 or more"
         )
-        until = self.close_goals_until
-        is_share = type(until) in (int, float) and 0 < until <= 1
-        require(is_share, "close_goals_until", until, "a number in (0, 1]")
         is_plain = (
             isinstance(self.run, str) and "/" not in self.run and self.run not in (".", "..") and "\0" not in self.run
         )

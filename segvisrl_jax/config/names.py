@@ -7,6 +7,7 @@ ObservationKind = Literal["segmentation", "rgb", "state", "state_and_rocks"]
 RendererName = Literal["auto", "scanline", "gl", "warp"]
 EngineName = Literal["auto", "native", "mjx"]
 PresetName = Literal["paper", "cpu", "gpu", "smoke"]
+LoggerName = Literal["wandb", "mlflow"]
 
 ARCH_OBSERVATION: dict[str, ObservationKind] = {
     "cnn_lstm": "segmentation",

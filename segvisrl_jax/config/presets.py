@@ -74,11 +74,13 @@ _CPU_STATE: dict[str, Any] = {
     "mlp_sizes": (256, 256),
     "every_decisions": 262_144,
 }
-# Without memory it must keep turning the same way until the goal is in view; at the map's edge it learns to turn back.
-_CNN: dict[str, Any] = {"close_goal_share": 1.0}
+# Without memory it must keep turning the same way until the goal is in view: it does so from the start, to the left,
+# and has no reason to unlearn it. From a mean straight ahead it learns to turn back at the map's edge, and swings.
+_CNN: dict[str, Any] = {"initial_turn": 0.6}
 _NO_ROCKS: dict[str, Any] = {"random_num_rocks_max": 0, "collision_margin_m": 0.0, "rocks": None}
 _BY_ARCH: dict[tuple[str, str], dict[str, Any]] = {
-    ("cpu", "cnn"): _CNN,
+    # Longer training only swings: seed 0 had 96.5 % among 32 rocks after 163,840 decisions and 85 to 93 % from there on.
+    ("cpu", "cnn"): _CNN | {"steps": 163_840, "every_decisions": 20_480},
     ("gpu", "cnn"): _CNN,
     ("cpu", "mlp_rocks"): _CPU_STATE,
     # It sees no rocks, so that more of them, or wider ones, would only be noise.

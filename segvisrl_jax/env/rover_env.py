@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from brax.envs.base import Env, State
-from jaxtyping import Array, Bool, Float32, Int32, PRNGKeyArray, Shaped, UInt8, UInt32
+from jaxtyping import Array, Bool, Int32, PRNGKeyArray, Shaped, UInt8, UInt32
 
 from segvisrl_jax.config import IMAGE_OBSERVATIONS, EngineName, EnvConfig, ObservationKind, RendererName, replace_fields
 from segvisrl_jax.env import model, rocks, task
@@ -134,14 +134,14 @@ class RoverEnv(Env):
 
     # the parts that training composes in its own order
 
-    def initial_state(self, key: PRNGKeyArray, close_goal_share: Float32[Array, ""] | None = None) -> RoverState:
+    def initial_state(self, key: PRNGKeyArray) -> RoverState:
         """The start of an episode on a scene drawn from the key (``sample_scene``), not looked at. Unbatched."""
-        scene = sample_scene(key, self.config.scene, self.rocks, close_goal_share)
+        scene = sample_scene(key, self.config.scene, self.rocks)
         return self.state_on(with_conditions(key, scene, self.config))
 
     def state_on(self, scene: Scene) -> RoverState:
         """The start of an episode on a given scene, under the scene's own conditions. Unbatched."""
-        start = self.start_xy_m(scene)
+        start = jnp.asarray(self.config.scene.start_xy_m, jnp.float32)
         clearance = task.rock_clearance_m(start[None], scene)[0]
         physics = self.engine.place(start, scene.start_yaw_rad)
         return RoverState(
@@ -154,11 +154,6 @@ class RoverEnv(Env):
             episode_return=jnp.float32(0.0),
             **first_memory(physics, scene),  # type: ignore[arg-type]
         )
-
-    def start_xy_m(self, scene: Scene) -> Float32[Array, "2"]:
-        """Where an episode on a scene starts, world frame. Unbatched."""
-        own = self.config.scene.start_xy_m if scene.start_xy_m is None else scene.start_xy_m
-        return jnp.asarray(own, jnp.float32)
 
     def advance(self, state: RoverState, action: Action) -> tuple[RoverState, StepResult]:
         """One decision of physics and task, without looking. Unbatched.

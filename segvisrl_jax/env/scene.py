@@ -4,46 +4,36 @@ The rules are those of the paper's section III-A and of ``SceneConfig``; ``Scene
 the rejection sampling here could not end.
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float32, PRNGKeyArray
 
 from segvisrl_jax.config import SceneConfig
-from segvisrl_jax.config.environment import CLOSE_GOAL_MAX_M, CLOSE_GOAL_MIN_M
 from segvisrl_jax.types import ConvexSolids, Scene
 
 FAR_AWAY_M = 1e4  # where a rock stands that has not been placed, or not yet: it keeps nothing clear
 
 
-def sample_scene(
-    key: PRNGKeyArray,
-    config: SceneConfig,
-    rocks: ConvexSolids,
-    close_goal_share: Float32[Array, ""] | None = None,
-) -> Scene:
+def sample_scene(key: PRNGKeyArray, config: SceneConfig, rocks: ConvexSolids) -> Scene:
     """Draws one scene.
 
     Args:
         key: one PRNG key.
         config: the rules.
         rocks: the rock library (``env.rocks.rock_library(config)``).
-        close_goal_share: in place of the settings' share, where that is above 0 (training lets it fall).
 
     Returns:
         A scene with ``config.most_rocks`` rocks: the goal uniform over the part of the map between the least and the
         largest distance from the start; each rock uniform over the part of the map that keeps clear of start, goal
         and earlier rocks, each of a different shape. With ``random_num_rocks_max``, a random number of them
-        stands far outside the map. With ``close_goal_share``, some scenes have their start in the middle of the map.
+        stands far outside the map.
     """
     goal_key, shape_key, place_key, yaw_key, start_key = jax.random.split(key, 5)
-    start = _sample_start(start_key, config, close_goal_share)
-    goal_xy = _sample_goal(goal_key, config, start)
+    goal_xy = _sample_goal(goal_key, config)
     shape = jax.random.permutation(shape_key, config.num_rock_shapes)[: config.most_rocks]
     shape = shape.astype(jnp.int32)
-    rock_xy = _place_rocks(place_key, config, start.xy_m, goal_xy, jnp.asarray(rocks.radius_m)[shape])
+    rock_xy = _place_rocks(place_key, config, goal_xy, jnp.asarray(rocks.radius_m)[shape])
     if config.random_num_rocks_max:
         number = jax.random.randint(jax.random.fold_in(shape_key, 1), (), 0, config.most_rocks + 1)
         rock_xy = jnp.where(jnp.arange(config.most_rocks)[:, None] < number, rock_xy, FAR_AWAY_M)
@@ -54,9 +44,8 @@ def sample_scene(
         rock_xy_m=rock_xy,
         rock_yaw_rad=yaw[:-1],
         rock_shape=shape,
-        start_yaw_rad=start.yaw_rad,
+        start_yaw_rad=_sample_start_yaw(start_key, config.random_start_yaw_share),
         sun_direction=jnp.asarray(sun_direction(config)),
-        start_xy_m=start.xy_m if config.close_goal_share else None,
     )
 
 
@@ -67,47 +56,23 @@ def sun_direction(config: SceneConfig) -> Float32[np.ndarray, "3"]:
     return np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], np.float32)
 
 
-class _Start(NamedTuple):
-    """Where an episode starts, and how far its goal may be."""
-
-    xy_m: Float32[Array, "2"]
-    yaw_rad: Float32[Array, ""]
-    goal_distance_min_m: float | Float32[Array, ""]
-    goal_distance_max_m: float | Float32[Array, ""]
-
-
-def _sample_start(key: PRNGKeyArray, config: SceneConfig, close_goal_share: Float32[Array, ""] | None) -> _Start:
-    """The settings' start, facing inwards (0) or anywhere; or the middle of the map, facing anywhere."""
-    yaw = _sample_start_yaw(key, config.random_start_yaw_share)
+def _sample_goal(key: PRNGKeyArray, config: SceneConfig) -> Float32[Array, "2"]:
     start = jnp.asarray(config.start_xy_m, jnp.float32)
-    usual = _Start(start, yaw, config.goal_distance_min_m, config.goal_distance_max_m)
-    if config.close_goal_share == 0:
-        return usual
-    choice_key, yaw_key = jax.random.split(jax.random.fold_in(key, 1))
-    close = _Start(jnp.zeros(2), _uniform_yaw(yaw_key), CLOSE_GOAL_MIN_M, CLOSE_GOAL_MAX_M)
-    share = config.close_goal_share if close_goal_share is None else close_goal_share
-    is_close = jax.random.uniform(choice_key, ()) < share
-    return jax.tree.map(lambda a, b: jnp.where(is_close, jnp.float32(a), jnp.float32(b)), close, usual)
 
-
-def _sample_goal(key: PRNGKeyArray, config: SceneConfig, start: _Start) -> Float32[Array, "2"]:
     def is_allowed(xy: Array) -> Bool[Array, ""]:
-        distance = jnp.linalg.norm(xy - start.xy_m)
-        return (distance >= start.goal_distance_min_m) & (distance <= start.goal_distance_max_m)
+        distance = jnp.linalg.norm(xy - start)
+        return (distance >= config.goal_distance_min_m) & (distance <= config.goal_distance_max_m)
 
     return _draw_until(key, config.map_size_m, is_allowed)
 
 
 def _place_rocks(
-    key: PRNGKeyArray,
-    config: SceneConfig,
-    start: Float32[Array, "2"],
-    goal_xy: Float32[Array, "2"],
-    radius: Float32[Array, "R"],
+    key: PRNGKeyArray, config: SceneConfig, goal_xy: Float32[Array, "2"], radius: Float32[Array, "R"]
 ) -> Float32[Array, "R 2"]:
     """One rock after another, each drawn until it keeps clear of start, goal and the rocks before it."""
     if config.most_rocks == 0:
         return jnp.zeros((0, 2), jnp.float32)
+    start = jnp.asarray(config.start_xy_m, jnp.float32)
     nowhere = jnp.full((config.most_rocks, 2), FAR_AWAY_M, jnp.float32)
 
     def place(placed: Array, rock: tuple[Array, PRNGKeyArray]) -> tuple[Array, None]:
@@ -141,8 +106,5 @@ def _draw_until(key: PRNGKeyArray, map_size_m: float, is_allowed) -> Float32[Arr
 def _sample_start_yaw(key: PRNGKeyArray, random_share: float) -> Float32[Array, ""]:
     """Facing inwards (0), or, with probability ``random_share``, uniform."""
     choice_key, yaw_key = jax.random.split(key)
-    return jnp.where(jax.random.uniform(choice_key, ()) < random_share, _uniform_yaw(yaw_key), 0.0)
-
-
-def _uniform_yaw(key: PRNGKeyArray) -> Float32[Array, ""]:
-    return jax.random.uniform(key, (), minval=-jnp.pi, maxval=jnp.pi)
+    yaw = jax.random.uniform(yaw_key, (), minval=-jnp.pi, maxval=jnp.pi)
+    return jnp.where(jax.random.uniform(choice_key, ()) < random_share, yaw, 0.0)

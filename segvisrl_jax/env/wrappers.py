@@ -28,7 +28,6 @@ class BatchState:
     rover: RoverState
     key: Key[Array, "B"]  # each environment draws its scenes from its own key
     is_first: Float32[Array, "B"]  # 1 where the episode begins with the next decision
-    close_goal_share: Float32[Array, ""] | None = None  # of scenes to come, in place of the settings'
 
 
 @struct.dataclass
@@ -84,17 +83,15 @@ class BatchEnv:
         """What every agent sees now, (B, ...)."""
         return jax.vmap(self.env.observe)(state.rover)
 
-    def _fresh(
-        self, keys: Key[Array, "B"], close_goal_share: Float32[Array, ""] | None = None
-    ) -> tuple[RoverState, Key[Array, "B"]]:
+    def _fresh(self, keys: Key[Array, "B"]) -> tuple[RoverState, Key[Array, "B"]]:
         def draw(key: PRNGKeyArray) -> tuple[RoverState, PRNGKeyArray]:
             scene_key, next_key = jax.random.split(key)
-            return self.env.initial_state(scene_key, close_goal_share), next_key
+            return self.env.initial_state(scene_key), next_key
 
         return jax.vmap(draw)(keys)
 
     def _reset_where(self, done: Array, state: BatchState) -> BatchState:
-        fresh, next_keys = self._fresh(state.key, state.close_goal_share)
+        fresh, next_keys = self._fresh(state.key)
         rover = select(done, fresh, state.rover)
         return dataclasses.replace(state, rover=rover, key=jnp.where(done, next_keys, state.key))
 

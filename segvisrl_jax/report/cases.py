@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -25,6 +25,26 @@ LEAST_DETOUR_M = 0.5  # less is not seen on a map
 PANELS_IN_ROW = 2
 PANEL_IN, TITLE_IN, FOOT_IN = 5.2, 0.2, 0.45
 PAD_IN = 0.1
+
+
+class Driven(Protocol):
+    """What scenes are chosen by: a kind (an architecture or a controller), and numbers of E episodes."""
+
+    @property
+    def kind(self) -> str:
+        """An architecture or a controller."""
+
+    @property
+    def outcome(self) -> Int[np.ndarray, "E"]:
+        """How each ended."""
+
+    @property
+    def path_length_m(self) -> Float[np.ndarray, "E"]:
+        """How far each drove."""
+
+    @property
+    def min_clearance_m(self) -> Float[np.ndarray, "E"]:
+        """How near to a rock's centre each came."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +79,7 @@ class Case(NamedTuple):
     scene: int  # which of the methods' episodes
 
 
-def find_cases(methods: Sequence[Method]) -> dict[str, int | None]:
+def find_cases(methods: Sequence[Driven]) -> dict[str, int | None]:
     """The paper's kinds of scenes among those driven: what each shows, and which scene, or None where there is none.
 
     Each is the first scene that shows it, but for the detour, which is the longest; no scene is taken twice.
@@ -83,7 +103,7 @@ def find_cases(methods: Sequence[Method]) -> dict[str, int | None]:
     return found
 
 
-def _dodged_m(methods: Sequence[Method], arrives: Bool[np.ndarray, "M E"]) -> Float[np.ndarray, "M E"]:
+def _dodged_m(methods: Sequence[Driven], arrives: Bool[np.ndarray, "M E"]) -> Float[np.ndarray, "M E"]:
     """How much farther each drove than the shortest way by which any method arrived, where it came near a rock.
 
     0 for what ended before its time, where no method arrived, and where it is too little to be seen.

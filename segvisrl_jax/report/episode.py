@@ -1,5 +1,6 @@
 """Recorded episodes: driving them, and the frames of one's video (camera, segmentation, what the policy sees, map)."""
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
@@ -141,7 +142,13 @@ class EpisodeView:
 
     def __init__(self, env: RoverEnv) -> None:
         self._env = env
-        self._segmented, self._coloured = (camera_view(env, kind) for kind in ("segmentation", "rgb"))
+        self.segmented, self.coloured = (camera_view(env, kind) for kind in ("segmentation", "rgb"))
+
+    def of(self, env: RoverEnv) -> "EpisodeView":
+        """The same view, compiled already, for an environment that differs only in what its policy sees."""
+        other = copy.copy(self)
+        other._env = env
+        return other
 
     def __call__(
         self,
@@ -159,8 +166,8 @@ class EpisodeView:
             title: what stands before the time and the outcome.
         """
         camera = [
-            Pane(np.asarray(self._coloured(rover)), "onboard camera"),
-            Pane(np.asarray(self._segmented(rover)), "segmentation"),
+            Pane(np.asarray(self.coloured(rover)), "onboard camera"),
+            Pane(np.asarray(self.segmented(rover)), "segmentation"),
         ]
         if observation is not None:
             camera.append(Pane(observation, observation_caption(self._env)))
@@ -175,7 +182,7 @@ class EpisodeView:
 def scene_map(env: RoverEnv, scene: Scene) -> SceneMap:
     """A scene from above."""
     return SceneMap(
-        start_xy_m=np.asarray(env.start_xy_m(scene)),
+        start_xy_m=np.asarray(env.config.scene.start_xy_m),
         goal_xy_m=np.asarray(scene.goal_xy_m),
         rock_xy_m=np.asarray(scene.rock_xy_m),
         rock_radius_m=env.rocks.radius_m[np.asarray(scene.rock_shape)],

@@ -184,19 +184,14 @@ def draw_learning_curves(curves: Sequence[Curve], path_png: Path) -> Path:
     named = []
     for (name, group), colour in zip(methods.items(), colours, strict=True):
         label = name if len(group) == 1 else f"{name}, {len(group)} seeds"
-        drawn = _draw_band(returns, [curve.returns for curve in group], colour, label)
-        named.append(_draw_band(success, [curve.success for curve in group], colour, label, marker="o") or drawn)
+        drawn = draw_band(returns, [curve.returns for curve in group], colour, label)
+        named.append(draw_band(success, [curve.success for curve in group], colour, label, marker="o") or drawn)
     returns.set_title("Return of training episodes", loc="left", fontsize=11)
     success.set_title("Held-out scenes: success", loc="left", fontsize=11)
     success.set_ylim(-0.02, 1.02)
     success.yaxis.set_major_formatter(PercentFormatter(1.0))
-    ends = [curve.returns.decisions[-1] for curve in curves]
-    is_log = max(ends) >= LOG_FROM * min(ends)
     for axes in (returns, success):
-        axes.set_xlabel("training decisions")
-        axes.set_xscale("log") if is_log else axes.set_xlim(left=0)
-        axes.xaxis.set_major_formatter(EngFormatter(sep=" "))
-        clear_frame(axes)
+        finish_decisions_axis(axes, curves)
     if any(len(group) > 1 for group in methods.values()):
         figure.supxlabel("Lines: median over seeds; bands: from the worst to the best seed.", fontsize=9, color="0.4")
     for axes in (returns, success):
@@ -204,7 +199,17 @@ def draw_learning_curves(curves: Sequence[Curve], path_png: Path) -> Path:
     return save_figure(figure, path_png, SHARP_DOTS_PER_INCH)
 
 
-def _draw_band(
+def finish_decisions_axis(axes: Axes, curves: Sequence[Curve]) -> None:
+    """Labels the axis of training decisions, logarithmic where the runs' lengths differ much, and clears the frame."""
+    ends = [curve.returns.decisions[-1] for curve in curves]
+    is_log = max(ends) >= LOG_FROM * min(ends)
+    axes.set_xlabel("training decisions")
+    axes.set_xscale("log") if is_log else axes.set_xlim(left=0)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=" "))
+    clear_frame(axes)
+
+
+def draw_band(
     axes: Axes, runs: Sequence[Series], colour: str, label: str, marker: str = ""
 ) -> tuple[Axes, LineEnd] | None:
     """One method in one panel: where its line ends; None where no run has such numbers."""

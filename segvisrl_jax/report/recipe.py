@@ -4,7 +4,7 @@ from typing import Any
 
 from segvisrl_jax.config import TrainConfig, flatten, to_dict
 
-BOOKKEEPING = ("seed", "run", "runs_dir", "resume", "checkpoint_every_updates", "evaluation")
+BOOKKEEPING = ("seed", "run", "runs_dir", "resume", "checkpoint_every_updates", "loggers", "evaluation")
 WHO_COMPUTES = ("env.renderer", "env.physics.engine", "env.physics.num_threads")
 
 

@@ -47,7 +47,6 @@ class Finished:
     episode_return: np.ndarray
     goal_xy_m: np.ndarray
     rock_xy_m: np.ndarray
-    start_xy_m: np.ndarray
     start_yaw_rad: np.ndarray
 
 
@@ -109,7 +108,7 @@ class Evaluator:
         driven, _ = jax.vmap(self.env.advance)(slots.rover, action)
         rover = select(is_driving, driven, slots.rover)
         done = is_driving & (rover.outcome != Outcome.RUNNING)
-        ended = _ended(self.env, slots.episode, done, rover)
+        ended = _ended(slots.episode, done, rover)
         after = dataclasses.replace(slots, rover=rover, carry=carry, is_first=jnp.zeros_like(slots.is_first))
         refill = functools.partial(self._refill, stream)
         return jax.lax.cond(jnp.any(done), refill, lambda _, s: s, done, after), ended
@@ -127,7 +126,7 @@ class Evaluator:
         )
 
 
-def _ended(env: RoverEnv, episode: Array, done: Array, rover: RoverState) -> dict[str, Array]:
+def _ended(episode: Array, done: Array, rover: RoverState) -> dict[str, Array]:
     return {
         "episode": jnp.where(done, episode, -1),
         "outcome": rover.outcome,
@@ -137,7 +136,6 @@ def _ended(env: RoverEnv, episode: Array, done: Array, rover: RoverState) -> dic
         "episode_return": rover.episode_return,
         "goal_xy_m": rover.scene.goal_xy_m,
         "rock_xy_m": rover.scene.rock_xy_m,
-        "start_xy_m": jax.vmap(env.start_xy_m)(rover.scene),
         "start_yaw_rad": rover.scene.start_yaw_rad,
     }
 
@@ -183,7 +181,7 @@ def summarize(finished: Finished, env: RoverEnv, shortest_m: np.ndarray | None =
     summary["mean_time_s"] = float(np.mean(time_s)) if succeeded.any() else None
     summary["min_clearance_m"] = clearance if np.isfinite(clearance) else None
     summary["mean_return"] = float(np.mean(finished.episode_return))
-    in_view = np.abs(goal_bearings_deg(finished)) <= env.config.camera.horizontal_fov_deg / 2
+    in_view = np.abs(goal_bearings_deg(finished, env)) <= env.config.camera.horizontal_fov_deg / 2
     return (
         summary | _success_of(succeeded[in_view], "goal_in_view") | _success_of(succeeded[~in_view], "goal_out_of_view")
     )
@@ -213,7 +211,7 @@ def per_episode(finished: Finished, env: RoverEnv, shortest_m: np.ndarray) -> di
         "path_length_m": _rounded(finished.path_length_m, 3),
         "shortest_path_m": _rounded(shortest_m, 3),
         "min_clearance_m": _rounded(finished.min_clearance_m, 3),
-        "goal_bearing_deg": _rounded(goal_bearings_deg(finished), 2),
+        "goal_bearing_deg": _rounded(goal_bearings_deg(finished, env), 2),
     }
 
 
@@ -221,9 +219,9 @@ def _rounded(values: np.ndarray, digits: int) -> list[float | None]:
     return [round(value, digits) if np.isfinite(value) else None for value in values.tolist()]
 
 
-def goal_bearings_deg(finished: Finished) -> np.ndarray:
+def goal_bearings_deg(finished: Finished, env: RoverEnv) -> np.ndarray:
     """Angle of every episode's goal off the rover's first heading, to the left, in [-180, 180], (episodes,)."""
-    offset = finished.goal_xy_m - finished.start_xy_m
+    offset = finished.goal_xy_m - np.asarray(env.config.scene.start_xy_m)
     angle = np.arctan2(offset[:, 1], offset[:, 0]) - finished.start_yaw_rad
     return np.degrees(np.arctan2(np.sin(angle), np.cos(angle)))
 
@@ -231,11 +229,12 @@ def goal_bearings_deg(finished: Finished) -> np.ndarray:
 def shortest_paths_m(finished: Finished, env: RoverEnv) -> np.ndarray:
     """Length of the shortest collision-free path of every episode's scene, (episodes,)."""
     scene, task = env.config.scene, env.config.task
-    rows = zip(finished.start_xy_m, finished.goal_xy_m, finished.rock_xy_m, strict=True)
+    pairs = zip(finished.goal_xy_m, finished.rock_xy_m, strict=True)
+    start = np.asarray(scene.start_xy_m)
     half = scene.map_size_m / 2
     return np.array(
         [
             shortest_path_m(start, goal, task.goal_radius_m, rocks, task.collision_radius_m, half)
-            for start, goal, rocks in rows
+            for goal, rocks in pairs
         ]
     )

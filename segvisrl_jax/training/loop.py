@@ -3,7 +3,7 @@
 import collections
 import dataclasses
 import json
-import signal
+import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float32, Int32
 
 from segvisrl_jax.agent.networks import Network, Params, make_network
 from segvisrl_jax.agent.ppo import Learner, LearnerState, make_learner
@@ -30,13 +29,18 @@ from segvisrl_jax.env.rover_env import RoverEnv, observation_shape
 from segvisrl_jax.env.wrappers import VALIDATION_STREAM, BatchEnv, scene_stream
 from segvisrl_jax.training.checkpoint import Checkpoints, load_policy, save_policy
 from segvisrl_jax.training.evaluation import Evaluator, summarize
+from segvisrl_jax.training.loggers import Logger
 from segvisrl_jax.training.metrics import MetricsWriter, ProgressDisplay
 from segvisrl_jax.training.policy import Policy, network_policy
 from segvisrl_jax.training.rollout import ActorState, EpisodeLog, start_acting, unroll
+from segvisrl_jax.training.stop_signals import StopSignals
+from segvisrl_jax.training.trackers import open_trackers, require_installed
 from segvisrl_jax.types import Outcome
 
 RECENT_EPISODES = 200  # what the progress bar's shares are taken over
-FREE_ON_RESUME = ("steps", "resume", "runs_dir", "run", "evaluation", "checkpoint_every_updates", "preset")
+FREE_ON_RESUME = (
+    "steps", "resume", "runs_dir", "run", "evaluation", "checkpoint_every_updates", "preset", "loggers",
+)  # fmt: skip
 OUTCOMES = (Outcome.SUCCESS, Outcome.COLLISION, Outcome.FALL, Outcome.TIMEOUT)
 
 
@@ -111,18 +115,7 @@ class Trainer:
         return summarize(finished, self.evaluator.env)
 
     def _unroll_batch(self, learner: LearnerState, actor: ActorState):
-        actor = _with_close_goals(actor, self._close_goal_share(learner.num_updates))
-        after, *found = unroll(learner.params, actor, self.batch, self.network, self.config.ppo)
-        return _with_close_goals(after, None), *found
-
-    def _close_goal_share(self, num_updates: Int32[Array, ""]) -> Float32[Array, ""] | None:
-        """Of the scenes drawn in the next rollout; None where there are none at any time."""
-        start, end = self.config.env.scene.close_goal_share, self.config.close_goals_until * self.config.num_updates
-        return None if start == 0 else start * jnp.maximum(1 - num_updates / end, 0)
-
-
-def _with_close_goals(actor: ActorState, share: Float32[Array, ""] | None) -> ActorState:
-    return dataclasses.replace(actor, env=dataclasses.replace(actor.env, close_goal_share=share))
+        return unroll(learner.params, actor, self.batch, self.network, self.config.ppo)
 
 
 def held_out_env(config: EnvConfig) -> EnvConfig:
@@ -130,12 +123,7 @@ def held_out_env(config: EnvConfig) -> EnvConfig:
 
     So it is whatever training is made of.
     """
-    neutral = {
-        "random_start_yaw_share": 0.0,
-        "close_goal_share": 0.0,
-        "random_num_rocks_max": 0,
-        "collision_margin_m": 0.0,
-    }
+    neutral = {"random_start_yaw_share": 0.0, "random_num_rocks_max": 0, "collision_margin_m": 0.0}
     return replace_fields(config, conditions=ConditionsConfig(), **neutral)
 
 
@@ -152,26 +140,38 @@ def train(config: TrainConfig, say=print) -> TrainResult:
 
     Raises:
         ConfigError: where the run folder exists and is not to be resumed, or cannot be; where the policy to start from
-            is of another architecture, or sees something else.
+            is of another architecture, or sees something else; where a logger is not installed or cannot be opened.
     """
     first_params = _params_to_start_from(config)
+    require_installed(config.loggers)
     run_dir = open_run_dir(config)
-    trainer = Trainer(config)
-    checkpoints = Checkpoints(run_dir)
-    state, host = trainer.start(first_params), HostState()
-    if config.resume:
-        state, data = checkpoints.restore_latest(state)
-        host = HostState(**data)
-        say(f"going on from update {host.updates} of {config.num_updates}")
-    try:
-        with MetricsWriter(run_dir) as writer, StopSignals() as stop:
-            writer.resume_at(host.updates * config.ppo.decisions_per_update)
-            session = _Session(config, run_dir, trainer, checkpoints, writer, stop)
-            state = session.drive(state, host)
-    finally:
-        checkpoints.close()
+    with MetricsWriter(run_dir, trackers=_open_trackers(config, run_dir), say=say) as writer:
+        trainer = Trainer(config)
+        checkpoints = Checkpoints(run_dir)
+        state, host = trainer.start(first_params), HostState()
+        if config.resume:
+            state, data = checkpoints.restore_latest(state)
+            host = HostState(**data)
+            say(f"going on from update {host.updates} of {config.num_updates}")
+        try:
+            with StopSignals() as stop:
+                writer.resume_at(host.updates * config.ppo.decisions_per_update)
+                session = _Session(config, run_dir, trainer, checkpoints, writer, stop)
+                state = session.drive(state, host)
+        finally:
+            checkpoints.close()
     done = host.updates * config.ppo.decisions_per_update
     return TrainResult(run_dir, host.updates >= config.num_updates, done, host.seconds)
+
+
+def _open_trackers(config: TrainConfig, run_dir: Path) -> dict[str, Logger]:
+    """What the settings name; where that fails, a new run leaves no folder behind that would be in the way."""
+    try:
+        return open_trackers(config, run_dir)
+    except ConfigError:
+        if not config.resume:
+            shutil.rmtree(run_dir)
+        raise
 
 
 def _params_to_start_from(config: TrainConfig) -> Params | None:
@@ -196,7 +196,7 @@ class _Session:
     trainer: Trainer
     checkpoints: Checkpoints
     writer: MetricsWriter
-    stop: "StopSignals"
+    stop: StopSignals
 
     def drive(self, state: TrainingState, host: HostState) -> TrainingState:
         """Updates until the run's end or a signal; the last state is always saved."""
@@ -273,33 +273,10 @@ def open_run_dir(config: TrainConfig) -> Path:
 def _require_same_run(config: TrainConfig, before: dict[str, Any], run_dir: Path) -> None:
     """Only the number of steps and bookkeeping may change when a run goes on. What old runs do not say is neutral."""
     now = flatten(json.loads(json.dumps(to_dict(config))))
-    unsaid = {"env": {"conditions": to_dict(ConditionsConfig())}, "close_goals_until": config.close_goals_until}
-    then = flatten(unsaid) | flatten(before)
+    then = flatten(to_dict(TrainConfig())) | flatten(before)
     for name, value in now.items():
         if name.split(".")[0] not in FREE_ON_RESUME and value != then.get(name):
             raise ConfigError(f"{name} = {value!r}: should be {then.get(name)!r}, as when {run_dir} was started")
-
-
-class StopSignals:
-    """While open, the first SIGINT or SIGTERM asks to stop after the current update; a second one ends at once."""
-
-    def __init__(self) -> None:
-        self.requested = False
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> "StopSignals":
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._before[number] = signal.signal(number, self._request)
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _request(self, number: int, frame: object) -> None:
-        if self.requested:
-            raise KeyboardInterrupt
-        self.requested = True
 
 
 def _finished_episodes(log: EpisodeLog) -> list[list[float]]:

@@ -1,30 +1,43 @@
-"""What a run writes down and shows while it runs: JSON lines, TensorBoard, a display of progress.
+"""What a run writes down and shows while it runs: every logger behind one writer, and a display of progress.
 
 A run's numbers are flat: ``{"episode/success": 0.93, "ppo/entropy": -0.4}`` at a step, which is the
-number of decisions so far. This file neither computes them nor draws figures.
+number of decisions so far. This file neither computes them nor draws figures; ``loggers`` puts them on disk.
 """
 
 import collections
 import datetime
-import json
 import math
-import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
-if TYPE_CHECKING:
-    from tensorboardX import SummaryWriter
+from segvisrl_jax.training.loggers import (
+    METRICS_FILE,
+    STEP_KEY,
+    TENSORBOARD_FOLDER,
+    JsonLines,
+    Logger,
+    TensorBoard,
+    one_line,
+    read_metrics,
+)
 
-METRICS_FILE = "metrics.jsonl"
-TENSORBOARD_FOLDER = "tensorboard"
-STEP_KEY = "step"
+__all__ = [
+    "METRICS_FILE",
+    "STEP_KEY",
+    "TENSORBOARD_FOLDER",
+    "MetricsWriter",
+    "ProgressDisplay",
+    "read_metrics",
+    "track",
+]
+
 PLAIN_INTERVAL_S = 30.0  # between two lines where nobody watches a terminal: a log stays readable
 REFRESHES_PER_S = 4.0  # of the terminal: looks live, costs nothing next to training
 RATE_WINDOW_S = 60.0  # the speed shown is that of the last minute: it follows changes, not noise
@@ -43,55 +56,47 @@ Item = TypeVar("Item")
 
 
 class MetricsWriter:
-    """Writes a run's numbers to ``metrics.jsonl`` and to TensorBoard event files.
+    """Writes a run's numbers to ``metrics.jsonl``, to TensorBoard event files, and to what else is given.
 
     Args:
         run_dir: the run's folder; made if it is missing.
         tensorboard: whether to write ``tensorboard/`` too.
+        trackers: more loggers, by name. One that fails is named once and dropped; the run's own files must not fail.
+        say: where that is said.
 
-    A line is one JSON object with ``step`` and the numbers, on disk when ``write`` returns; what is
-    not finite is written as null. An existing file is continued; call ``resume_at`` first where the
-    run goes on from a checkpoint.
+    An existing file is continued; call ``resume_at`` first where the run goes on from a checkpoint.
     """
 
-    def __init__(self, run_dir: Path, tensorboard: bool = True) -> None:
-        self.path = Path(run_dir) / METRICS_FILE
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._events_dir = self.path.parent / TENSORBOARD_FOLDER if tensorboard else None
-        self._events: SummaryWriter | None = None
-        self._purge_step: int | None = None
-        _rewrite(self.path, lambda row: True)  # a line that a crash cut off is dropped
-        self._file = self.path.open("a", encoding="utf-8")
+    def __init__(
+        self,
+        run_dir: Path,
+        tensorboard: bool = True,
+        trackers: Mapping[str, Logger] | None = None,
+        say: Callable[[str], None] = print,
+    ) -> None:
+        self._own: list[JsonLines | TensorBoard] = [JsonLines(run_dir)]
+        if tensorboard:
+            self._own.append(TensorBoard(run_dir))
+        self._trackers, self._say = dict(trackers or {}), say
 
     def resume_at(self, step: int) -> None:
-        """Drops every line beyond ``step``, so that a run resumed there does not write them twice.
-
-        TensorBoard is told to hide the events beyond ``step``.
-        """
-        self._file.close()
-        _rewrite(self.path, lambda row: row[STEP_KEY] <= step)
-        self._file = self.path.open("a", encoding="utf-8")
-        self._close_events()
-        self._purge_step = step + 1
+        """Drops every line beyond ``step``, so that a run resumed there does not write them twice."""
+        for logger in self._own:
+            logger.resume_at(step)
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
-        """Writes one line. Values are numbers or arrays of one number (NumPy, JAX)."""
+        """Writes one line. Values are numbers or arrays of one number (NumPy, JAX); what is not finite becomes null."""
         numbers = {name: _number(value) for name, value in values.items()}
-        row = {STEP_KEY: int(step), **numbers}
-        self._file.write(json.dumps(row, allow_nan=False) + "\n")
-        self._file.flush()
-        if self._events_dir is None:
-            return
-        events = self._open_events(self._events_dir)
-        for name, number in numbers.items():
-            if number is not None:
-                events.add_scalar(name, number, int(step))
-        events.flush()
+        for logger in self._own:
+            logger.log(int(step), numbers)
+        self._for_trackers(lambda tracker: tracker.log(int(step), numbers))
 
     def close(self) -> None:
         """Closes the files; a second call does nothing."""
-        self._file.close()
-        self._close_events()
+        for logger in self._own:
+            logger.close()
+        self._for_trackers(lambda tracker: tracker.close())
+        self._trackers = {}
 
     def __enter__(self) -> "MetricsWriter":
         return self
@@ -99,47 +104,14 @@ class MetricsWriter:
     def __exit__(self, *exception: object) -> None:
         self.close()
 
-    def _open_events(self, folder: Path) -> "SummaryWriter":
-        """The event writer; each gets a file of its own, even two within one second."""
-        if self._events is None:
-            from tensorboardX import SummaryWriter
-
-            number = len(list(folder.glob("events.*"))) if folder.exists() else 0
-            self._events = SummaryWriter(str(folder), purge_step=self._purge_step, filename_suffix=f".{number}")
-        return self._events
-
-    def _close_events(self) -> None:
-        if self._events is not None:
-            self._events.close()
-            self._events = None
-
-
-def read_metrics(run_dir: Path) -> list[dict[str, Any]]:
-    """The lines of a run's ``metrics.jsonl`` in order; without the last one where it is cut off.
-
-    Raises:
-        FileNotFoundError: where the run has none.
-    """
-    rows = []
-    with (Path(run_dir) / METRICS_FILE).open(encoding="utf-8") as file:
-        for line in file:
-            if line.endswith("\n"):
-                rows.append(json.loads(line))
-    return rows
-
-
-def _rewrite(path: Path, is_kept: Callable[[dict[str, Any]], bool]) -> None:
-    """Keeps the whole lines for which ``is_kept(row)`` holds, in one move."""
-    if not path.exists():
-        return
-    text = path.read_text(encoding="utf-8")
-    whole = [line for line in text.splitlines(keepends=True) if line.endswith("\n")]
-    kept = "".join(line for line in whole if is_kept(json.loads(line)))
-    if kept == text:
-        return
-    temporary = path.with_suffix(".partial")
-    temporary.write_text(kept, encoding="utf-8")
-    os.replace(temporary, path)
+    def _for_trackers(self, do: Callable[[Logger], None]) -> None:
+        for name, tracker in list(self._trackers.items()):
+            try:
+                do(tracker)
+            except Exception as error:  # a service may fail in any way; the training is worth more
+                del self._trackers[name]
+                why = one_line(error)
+                self._say(f"warning: the logger {name} failed and gets no more numbers ({why}); the run goes on")
 
 
 def _number(value: Any) -> int | float | None:

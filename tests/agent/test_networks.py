@@ -270,3 +270,11 @@ def test_raw_images_go_through_the_same_network() -> None:
 def test_what_cannot_be_built_is_refused(arch: str, shape: tuple[int, ...], field: str) -> None:
     with pytest.raises(ConfigError, match=field):
         make_network(arch, SMALL, shape)
+
+
+@pytest.mark.parametrize(("turn", "bounded"), [(0.6, True), (-0.4, True), (0.6, False), (0.0, True)])
+def test_a_fresh_policy_turns_as_it_is_told(turn, bounded):
+    network = make_network("mlp", NetworkConfig(initial_turn=turn, bounded_mean=bounded), (7,))
+    params = network.init(jax.random.key(0))
+    _, output = network.step(params, (), jnp.zeros((1, 7)), jnp.ones(1))
+    np.testing.assert_allclose(output.mean[0], [0.5 - turn / 2, 0.5 + turn / 2], atol=1e-5)

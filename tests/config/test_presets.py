@@ -56,10 +56,10 @@ def test_validation_rocks_must_fit(rocks, says):
         replace_fields(preset_config("cnn", "cpu"), rocks=rocks)
 
 
-def test_without_memory_close_goals_teach_to_search():
-    shares = {arch: preset_config(arch, "cpu").env.scene.close_goal_share for arch in ARCHS}
-    assert shares.pop("cnn") == 1.0
-    assert set(shares.values()) == {0}
+def test_only_what_has_no_memory_turns_before_training():
+    turns = {arch: preset_config(arch, "cpu").network.initial_turn for arch in ARCHS}
+    assert turns.pop("cnn") > 0
+    assert set(turns.values()) == {0}
 
 
 def test_most_rocks_must_fit_and_have_shapes():

@@ -114,23 +114,6 @@ def test_share_of_random_headings(share, lowest, highest):
     assert np.all(np.abs(yaw) <= np.pi)
 
 
-def test_close_goals_are_around_the_middle_of_the_map():
-    config = SceneConfig(close_goal_share=0.5)
-    scene = scenes(config, seed=2)
-    is_close = np.all(scene.start_xy_m == 0.0, axis=-1)
-    np.testing.assert_array_equal(scene.start_xy_m[~is_close], np.tile(config.start_xy_m, (np.sum(~is_close), 1)))
-    assert 0.46 <= np.mean(is_close) <= 0.54
-    distance = np.linalg.norm(scene.goal_xy_m - scene.start_xy_m, axis=-1)
-    assert np.all((distance >= 2 - ROUNDING_M) & (distance <= 8 + ROUNDING_M) == is_close)
-    assert np.all((distance >= 10 - ROUNDING_M) & (distance <= 16 + ROUNDING_M) == ~is_close)
-    assert np.ptp(scene.start_yaw_rad[is_close]) > 6
-    assert np.all(scene.start_yaw_rad[~is_close] == 0.0)
-    bearing = np.arctan2(*scene.goal_xy_m[is_close].T[::-1])
-    assert np.all(np.histogram(bearing, bins=4, range=(-np.pi, np.pi))[0] > 0.2 * np.sum(is_close))
-    from_start = np.linalg.norm(scene.rock_xy_m - scene.start_xy_m[:, None], axis=-1)
-    assert np.all(from_start >= config.rock_start_clearance_m - ROUNDING_M)
-
-
 def test_sun_direction_is_a_unit_vector_towards_the_sun():
     np.testing.assert_allclose(sun_direction(SceneConfig(sun_elevation_deg=90.0)), [0, 0, 1], atol=1e-6)
     towards_left = sun_direction(SceneConfig(sun_azimuth_deg=90.0, sun_elevation_deg=30.0))
@@ -149,8 +132,6 @@ def test_sun_direction_is_a_unit_vector_towards_the_sun():
         {"rock_goal_clearance_m": 0.4},
         {"map_size_m": float("nan")},
         {"num_rocks": 65},
-        {"close_goal_share": 1.5},
-        {"close_goal_share": 0.1, "map_size_m": 15.0, "goal_distance_max_m": 12.0},
     ],
 )
 def test_a_scene_that_cannot_be_is_refused_when_configured(wrong):

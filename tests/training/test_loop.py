@@ -62,26 +62,6 @@ def test_stopping_and_going_on_changes_no_bit(arch, tmp_path):
         assert {k: v for k, v in a.items() if "time/" not in k} == {k: v for k, v in b.items() if "time/" not in k}
 
 
-def test_close_goals_get_fewer_until_there_are_none(tmp_path):
-    config = tiny("mlp", tmp_path, 4, close_goal_share=1.0, close_goals_until=0.5, max_decisions=4)
-    trainer = loop.Trainer(config)
-    state = trainer.start()
-    shares = []
-    for _ in range(4):
-        state, *_ = trainer.update(state)  # each drives every environment to two time limits
-        is_close = np.all(np.asarray(state.actor.env.rover.scene.start_xy_m) == 0.0, axis=-1)
-        shares.append(float(np.mean(is_close)))
-    assert shares[0] == 1.0
-    assert shares[2:] == [0.0, 0.0]
-    assert state.actor.env.close_goal_share is None
-
-
-@pytest.mark.parametrize("wrong", [0.0, 1.5, float("nan"), "x", True, None])
-def test_close_goals_end_within_the_training(wrong):
-    with pytest.raises(ConfigError, match=f"close_goals_until = {wrong!r}: should be a number in"):
-        replace_fields(preset_config("cnn", "cpu"), close_goals_until=wrong)
-
-
 def stop_after(config, updates):
     """Trains and sends itself the signal of Ctrl-C once ``updates`` updates are done."""
     original = loop.Trainer.update

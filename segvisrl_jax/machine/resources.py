@@ -1,0 +1,100 @@
+"""Cores, memory and disk, as far as this process may use them."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from segvisrl_jax.machine.finding import GIB, Finding
+
+SECTION = "this machine"
+CGROUP = Path("/sys/fs/cgroup")
+LEAST_MEMORY_GIB = 4.0  # training takes 1 to 3 GiB with the preset cpu, most of it while compiling
+LEAST_DISK_GIB = 1.0  # a run takes some 20 MB, and compiled kernels and videos come on top
+BUSY_SHARE = 0.5  # of the cores: above it, what is measured here is not what the machine can do
+
+
+def look(runs_dir: Path, cgroup: Path = CGROUP) -> Iterator[Finding]:
+    """Cores, load, memory, and the disk that runs are written to."""
+    usable = usable_cores(cgroup)
+    yield _cores(os.cpu_count() or 1, usable)
+    yield from _load(usable)
+    yield _memory(free_memory_bytes(cgroup))
+    yield _disk(runs_dir)
+
+
+def usable_cores(cgroup: Path = CGROUP) -> float:
+    """Cores that the scheduler and a container's quota leave to this process; may be a fraction."""
+    has_affinity = hasattr(os, "sched_getaffinity")
+    allowed: float = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
+    return min(allowed, _quota(cgroup) or allowed)
+
+
+def _quota(cgroup: Path) -> float | None:
+    """Cores of a container's quota, in either version of Linux's control groups; None where there is none."""
+    words = (_read(cgroup / "cpu.max") or "").split()
+    if not words:
+        words = [_read(cgroup / "cpu" / f"cpu.cfs_{name}_us") or "" for name in ("quota", "period")]
+    if len(words) != 2 or not all(word.isdigit() for word in words):  # "max" and -1 stand for no quota
+        return None
+    return int(words[0]) / int(words[1])
+
+
+def free_memory_bytes(cgroup: Path = CGROUP, meminfo: Path = Path("/proc/meminfo")) -> int | None:
+    """What the system and a container's limit leave; None where neither tells."""
+    free = []
+    for line in (_read(meminfo) or "").splitlines():
+        if line.startswith("MemAvailable:"):
+            free.append(int(line.split()[1]) * 1024)
+    limit, used = _read(cgroup / "memory.max"), _read(cgroup / "memory.current")
+    if limit and used and limit.isdigit():
+        free.append(int(limit) - int(used))
+    return min(free, default=None)
+
+
+def _read(path: Path) -> str | None:
+    try:
+        return path.read_text().strip()
+    except OSError:
+        return None
+
+
+def _cores(present: int, usable: float) -> Finding:
+    if usable >= present:
+        return Finding(SECTION, "cores", str(present))
+    remedy = f"Physics takes a thread for each core that is there: add --env.physics.num-threads {max(1, int(usable))}."
+    return Finding(SECTION, "cores", f"{present}, of which this process may use {usable:g}", "note", remedy)
+
+
+def _load(usable: float) -> Iterator[Finding]:
+    if not hasattr(os, "getloadavg"):
+        return
+    load = os.getloadavg()[0]
+    if load <= BUSY_SHARE * usable:
+        yield Finding(SECTION, "load", f"{load:.1f}")
+        return
+    remedy = "Other programs are at work: what is measured below is less than this machine can do."
+    yield Finding(SECTION, "load", f"{load:.1f} on {usable:g} cores", "note", remedy)
+
+
+def _memory(free: int | None) -> Finding:
+    if free is None:
+        return Finding(SECTION, "free memory", "unknown", "note", "The system does not tell; 4 GiB should be free.")
+    text = f"{free / GIB:.1f} GiB"
+    if free >= LEAST_MEMORY_GIB * GIB:
+        return Finding(SECTION, "free memory", text)
+    remedy = f"Less than {LEAST_MEMORY_GIB:g} GiB: close other programs, or train with fewer environments: "
+    return Finding(SECTION, "free memory", text, "problem", remedy + "--ppo.num-envs 8.")
+
+
+def _disk(runs_dir: Path) -> Finding:
+    folder = runs_dir.absolute()
+    existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
+    name, free = f"disk for {runs_dir}/", shutil.disk_usage(existing).free
+    if not (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)):
+        remedy = "Train where you may write, or name another folder with --runs-dir."
+        return Finding(SECTION, name, f"{existing} cannot be written to", "problem", remedy, stops_training=True)
+    text = f"{free / GIB:.1f} GiB free"
+    if free >= LEAST_DISK_GIB * GIB:
+        return Finding(SECTION, name, text)
+    return Finding(SECTION, name, text, "problem", "Make room, or name a folder on another disk with --runs-dir.")

@@ -1,0 +1,200 @@
+"""What a folder of runs holds: a summary of each run, and what is no run or is damaged.
+
+It reads settings and numbers as plain data, so that runs of other versions are listed too. It prints nothing.
+"""
+
+import json
+import math
+import statistics
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from segvisrl_jax.training.loggers import METRICS_FILE, STEP_KEY, is_being_written, read_metrics
+
+State = Literal["finished", "running", "stopped"]
+CONFIG_FILE, TEST_FILE = "config.json", "eval.json"
+LEAST_PATIENCE_S = 300.0  # a run that nobody locks counts as running for this long after its last line,
+PATIENCE_UPDATES = 5  # or for as long as this many updates take: an evaluation lies between two lines
+RECENT_LINES = 10  # what the time of an update is taken from
+WHAT_READING_RAISES = (OSError, ValueError, KeyError, TypeError, AttributeError, ZeroDivisionError)
+
+
+@dataclass(frozen=True)
+class Score:
+    """A success share, with its 95 % interval where the file has it."""
+
+    success: float
+    low: float | None
+    high: float | None
+    at: int
+    """Held-out: after this many training decisions. Test: over this many episodes."""
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """One run, from its files alone."""
+
+    name: str
+    arch: str
+    preset: str
+    seed: int
+    decisions: int
+    decisions_asked: int
+    state: State
+    held_out: Score | None
+    """The best evaluation while training: the one whose policy was kept."""
+    test: Score | None
+    hours: float
+    """Spent training, over all sittings, without evaluations."""
+    changed_s: float
+    """When the last line was written: seconds since 1970."""
+
+
+@dataclass(frozen=True)
+class Complaint:
+    """A folder that is no run, or what of a run cannot be read."""
+
+    name: str
+    reason: str
+
+
+def list_runs(folder: Path) -> tuple[list[RunSummary], list[Complaint]]:
+    """The runs right inside a folder, or the folder itself where it is a run; by name.
+
+    Raises:
+        OSError: where the folder cannot be read.
+    """
+    if (folder / CONFIG_FILE).is_file():
+        inside = [folder]
+    else:
+        inside = sorted(path for path in folder.iterdir() if _may_be_run(path))
+    found = [one for path in inside for one in _read(path)]
+    runs = [one for one in found if isinstance(one, RunSummary)]
+    return runs, [one for one in found if isinstance(one, Complaint)]
+
+
+def _may_be_run(path: Path) -> bool:
+    return not path.name.startswith(".") and (path.is_dir() or path.is_symlink())
+
+
+def _read(path: Path) -> Iterator[RunSummary | Complaint]:
+    """A run, what is wrong with it, or both."""
+    name = path.resolve().name if path == Path(".") else path.name
+    try:
+        if not (path / CONFIG_FILE).is_file():
+            yield Complaint(name, _why_no_run(path))
+            return
+        test: Score | None = None
+        try:
+            test = _test_score(path)
+        except WHAT_READING_RAISES as error:
+            yield Complaint(name, f"{TEST_FILE} cannot be read ({_one_line(error)})")
+        yield _summary(name, path, test)
+    except WHAT_READING_RAISES as error:
+        yield Complaint(name, f"cannot be read ({_one_line(error)})")
+
+
+def _why_no_run(path: Path) -> str:
+    if not path.exists():
+        return "a link to nothing"
+    if (path / "policy" / "policy.json").is_file() or (path / "policy.json").is_file():
+        return "a policy without its run (no config.json)"
+    num_runs = len(list(path.glob(f"*/{CONFIG_FILE}")))
+    return f"no run, but {num_runs} inside: segvisrl runs {path}" if num_runs else "no run (no config.json)"
+
+
+def _summary(name: str, path: Path, test: Score | None) -> RunSummary:
+    config = _object(path / CONFIG_FILE)
+    per_update = config["ppo"]["num_envs"] * config["ppo"]["unroll_length"]
+    asked = math.ceil(config["steps"] / per_update) * per_update
+    rows = _metrics(path)
+    done = int(rows[-1][STEP_KEY]) if rows else 0
+    file = path / METRICS_FILE
+    changed_s = (file if file.exists() else path / CONFIG_FILE).stat().st_mtime
+    return RunSummary(
+        name=name,
+        arch=str(config["arch"]),
+        preset=str(config["preset"]),
+        seed=int(config["seed"]),
+        decisions=done,
+        decisions_asked=asked,
+        state=_state(path, rows, done, asked, per_update, changed_s),
+        held_out=_best(rows),
+        test=test,
+        hours=float(rows[-1].get("time/seconds", 0.0)) / 3600 if rows else 0.0,
+        changed_s=changed_s,
+    )
+
+
+def _object(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path.name}: {error}") from None
+    if not isinstance(data, dict):
+        raise ValueError(f"{path.name}: holds a {type(data).__name__}, not an object")
+    return data
+
+
+def _metrics(path: Path) -> list[dict[str, Any]]:
+    """The lines so far; none before the first is written."""
+    if not (path / METRICS_FILE).is_file():
+        return []
+    try:
+        rows = read_metrics(path)
+    except ValueError as error:
+        raise ValueError(f"{METRICS_FILE}: {error}") from None
+    for number, row in enumerate(rows, start=1):
+        if not isinstance(row, dict) or not isinstance(row.get(STEP_KEY), int):
+            raise ValueError(f"{METRICS_FILE}: line {number} has no step")
+    return rows
+
+
+def _state(path: Path, rows: list[dict[str, Any]], done: int, asked: int, per_update: int, changed_s: float) -> State:
+    """Running: a process of this machine holds the metrics file, or its last line is fresh and no end has been saved.
+
+    The second is for runs on another machine whose folder is shared. A run that ends early saves a checkpoint behind
+    its last line, and so cannot be taken for a running one.
+    """
+    if is_being_written(path):
+        return "running"
+    if done >= asked:
+        return "finished"
+    speeds = [row["time/decisions_per_second"] for row in rows[-RECENT_LINES:] if row.get("time/decisions_per_second")]
+    update_s = per_update / statistics.median(speeds) if speeds else 0.0
+    is_fresh = time.time() - changed_s < max(LEAST_PATIENCE_S, PATIENCE_UPDATES * update_s)
+    is_saved = (path / "checkpoints" / str(done // per_update)).is_dir()
+    return "running" if is_fresh and not is_saved else "stopped"
+
+
+def _best(rows: list[dict[str, Any]]) -> Score | None:
+    """The evaluation that training kept the policy of: most successes, then fewest collisions, then shortest paths."""
+    evaluated = [row for row in rows if row.get("evaluation/success") is not None]
+    if not evaluated:
+        return None
+
+    def rank(row: dict[str, Any]) -> tuple[float, float, float, int]:
+        values = [row.get(f"evaluation/{name}") or 0.0 for name in ("success", "collision", "spl")]
+        return values[0], -values[1], values[2], row[STEP_KEY]
+
+    best = max(evaluated, key=rank)
+    low, high = (best.get(f"evaluation/success_{end}") for end in ("low", "high"))
+    return Score(float(best["evaluation/success"]), low, high, best[STEP_KEY])
+
+
+def _test_score(path: Path) -> Score | None:
+    """What was driven after training; None where it was not."""
+    if not (path / TEST_FILE).is_file():
+        return None
+    data = _object(path / TEST_FILE)
+    low, high = data["success_ci95"]
+    return Score(float(data["success"]), float(low), float(high), int(data["episodes"]))
+
+
+def _one_line(error: Exception) -> str:
+    """What is wrong; a missing name is said as such."""
+    text = " ".join(str(error).split())[:200] or type(error).__name__
+    return f"no {text}" if isinstance(error, KeyError) else text
