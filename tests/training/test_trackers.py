@@ -176,8 +176,10 @@ def test_wandb_offline_goes_on_in_the_same_run(tmp_path):
 def logged(file):
     """(step, seconds) of the lines in an offline file of Weights & Biases, which a process of its own writes."""
     deadline = time.monotonic() + 60
-    while (records := records_in(file))[-1].WhichOneof("record_type") != "exit" and time.monotonic() < deadline:
+    while "exit" not in (kinds := [one.WhichOneof("record_type") for one in records_in(file)]):
+        assert time.monotonic() < deadline, kinds
         time.sleep(0.1)
+    records = records_in(file)
     lines = [
         {item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in record.history.item}
         for record in records
@@ -193,10 +195,11 @@ def records_in(file):
 
     data, at, records = file.read_bytes(), 7, []  # behind the file's own header
     assert len(data) < 32768
-    while at < len(data):
+    while at + 7 <= len(data):
         size = int.from_bytes(data[at + 4 : at + 6], "little")  # a checksum, the size, the kind of record
-        records.append(wandb_internal_pb2.Record.FromString(data[at + 7 : at + 7 + size]))
-        at += 7 + size
+        content, at = data[at + 7 : at + 7 + size], at + 7 + size
+        if at <= len(data):  # else it is half written
+            records.append(wandb_internal_pb2.Record.FromString(content))
     return records
 
 
