@@ -33,6 +33,7 @@ EXPERIMENTS = (
     Experiment("renderer_agreement.py", ("3",), ("renderer_agreement.png",)),
 )
 FIGURES = (  # of evaluations, runs and policies, which ``material`` makes: run by their own test
+    Experiment("bearings.py", ("p30.json",), ("bearings.png",), False),
     Experiment("curves.py", ("p0.json", "p8.json", "planner0.json", "--x", "num_rocks"), ("density.png",), False),
     Experiment("failures.py", ("policy", "--episodes", "2", "--most", "1"), ("failures.png",), False),
     Experiment("learning_curves.py", ("run",), ("learning_curves.png",), False),
@@ -108,9 +109,9 @@ def material(tmp_path_factory):
     config = preset_config("cnn_lstm", "smoke")
     network = make_network(config.arch, config.network, observation_shape(config.env))
     save_policy(folder / "policy", config, network.init(jax.random.key(0)), {})
-    for name, rocks in (("p", 0), ("p", 8), ("planner", 0)):
+    for name, rocks, episodes in (("p", 0, 6), ("p", 8, 6), ("p", 30, 40), ("planner", 0, 6)):
         words = ["--controller", name, "--num-rocks", str(rocks), "--json", str(folder / f"{name}{rocks}.json")]
-        assert main(["eval", *words, "--episodes", "6"]) == 0
+        assert main(["eval", *words, "--episodes", str(episodes)]) == 0
     return folder
 
 
@@ -177,6 +178,7 @@ def test_the_visual_gap_goes_on_where_it_was(material, tmp_path, monkeypatch, ca
 
 
 MISTAKES = (
+    ("bearings.py", (), "EVAL.json = 'none given': should be files that segvisrl eval --json wrote"),
     ("curves.py", ("p0.json", "planner0.json"), "--x = 'scene.num_rocks': should be a setting in which the files"),
     ("curves.py", ("p0.json", "p8.json", "--x", "rocks"), "--x = 'rocks': should be a setting of the environment"),
     ("failures.py", ("nobody",), "nobody"),
