@@ -26,6 +26,13 @@ class DemoOptions:
     num_rocks: int | None = None
     output: Path = Path("demo.mp4")
     """Where to write the video, .mp4 or .gif."""
+    gif: bool = False
+    """Write a GIF of that name instead: it plays in a README, and is larger."""
+
+    @property
+    def video(self) -> Path:
+        """The file that is written."""
+        return self.output.with_suffix(".gif") if self.gif else self.output
 
     def __post_init__(self) -> None:
         require(0 <= self.scene < 2**31, "--scene", self.scene, "in [0, 2^31)")
@@ -35,10 +42,10 @@ class DemoOptions:
 def run(options: Sequence[str]) -> int:
     """Parses, drives, writes."""
     asked = parse(DemoOptions, options, "demo")
-    if not asked.output.resolve().parent.is_dir():
-        raise ConfigError(f"--output = {str(asked.output)!r}: should be in a folder that exists")
+    if not asked.video.resolve().parent.is_dir():
+        raise ConfigError(f"--output = {str(asked.video)!r}: should be in a folder that exists")
     outcome = record(asked)
-    print(f"{outcome}: {asked.output}")
+    print(f"{outcome}: {asked.video}")
     return 0
 
 
@@ -56,7 +63,7 @@ def record(asked: DemoOptions) -> str:
     env = RoverEnv(with_overrides(config, asked.num_rocks, None, None))
     episode = drive_episode(env, policy, params, scene_stream(asked.scene, TEST_STREAM))
     frames = episode_frames(env, episode, title=policy.name)
-    write_video(asked.output, frames, fps=FRAMES_PER_SECOND)
+    write_video(asked.video, frames, fps=FRAMES_PER_SECOND)
     return episode.outcome.name.lower()
 
 

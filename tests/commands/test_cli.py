@@ -93,6 +93,14 @@ def test_train_eval_demo_as_a_user_does(arch, tmp_path):
     assert result["config"]["scene"]["num_rocks"] == 2
 
 
+def test_demo_writes_a_gif_of_the_shipped_policy_where_asked(tmp_path):
+    done = segvisrl("demo", "--policy", "cnn", "--scene", "3", "--gif", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith(": demo.gif\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["demo.gif"]
+    assert (tmp_path / "demo.gif").read_bytes().startswith(b"GIF8")
+
+
 def test_bench_prints_a_table_and_writes_the_same_numbers(tmp_path):
     words = [
         "bench",
