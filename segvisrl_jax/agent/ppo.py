@@ -57,12 +57,6 @@ class LearnerState:
     rate_share: Float32[Array, ""]  # of the scheduled learning rate; below 1 while updates move the policy too far
     num_updates: Int32[Array, ""]
     num_gradient_steps: Int32[Array, ""]  # applied, not skipped
-    average: Params | None = None  # of the parameters over updates; None where none is kept
-
-    @property
-    def judged_params(self) -> Params:
-        """What drives when learning is judged, and what is kept: the average where there is one."""
-        return self.params if self.average is None else self.average
 
 
 @struct.dataclass
@@ -114,8 +108,7 @@ class Learner:
         """Fresh parameters and optimiser state."""
         params = self.network.init(key)
         opt_state = self.optimizer.init(params)
-        average = params if self.config.average_decay > 0 else None
-        return LearnerState(params, opt_state, jnp.ones(()), _zero(jnp.int32), _zero(jnp.int32), average)
+        return LearnerState(params, opt_state, jnp.ones(()), _zero(jnp.int32), _zero(jnp.int32))
 
     def update(
         self,
@@ -254,13 +247,6 @@ class Learner:
         lower = jnp.where(kl > KL_TOLERANCE * target, share / KL_FACTOR, share)
         return jnp.where(kl < target / KL_TOLERANCE, jnp.minimum(share * KL_FACTOR, 1.0), lower)
 
-    def _next_average(self, state: LearnerState) -> Params | None:
-        """With the parameters after an update (Polyak and Juditsky, 1992; exponential, since early ones are worse)."""
-        if state.average is None:
-            return None
-        decay = self.config.average_decay
-        return jax.tree.map(lambda old, new: decay * old + (1 - decay) * new, state.average, state.params)
-
     def _goes_on(self, progress: Progress) -> Array:
         """Whether another epoch follows."""
         more = progress.num_epochs_done < self.config.num_epochs
@@ -275,7 +261,6 @@ class Learner:
             before,
             rate_share=self._next_rate_share(before.rate_share, progress.last_kl),
             num_updates=before.num_updates + 1,
-            average=self._next_average(before),
         )
         count = jnp.maximum(progress.num_applied, 1).astype(jnp.float32)
         means = jax.tree.map(lambda leaf: leaf / count, progress.terms_sum)

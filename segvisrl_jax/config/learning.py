@@ -81,9 +81,6 @@ class PPOConfig:
     """The rate falls below its line while updates move the policy farther than this, and comes back; 0 never."""
     redraw_observations: bool = False
     """Keep scenes and poses in place of images and draw these again in every epoch: less memory, more rendering."""
-    average_decay: float = 0.0
-    """What is judged and kept is a moving average of the parameters, which keeps this share of itself at each update
-    and swings less than they do; 0: the parameters as they are."""
     bootstrap_on_timeout: bool = False
     """Whether the last value stands in for what the time limit cut off; else it is an end like any other."""
 
@@ -105,7 +102,6 @@ class PPOConfig:
         for name in ("final_learning_rate_share", "discount", "gae_lambda"):
             value = getattr(self, name)
             require(0 <= value <= 1, f"{p}.{name}", value, "in [0, 1]")
-        require(0 <= self.average_decay < 1, f"{p}.average_decay", self.average_decay, "in [0, 1)")
         require(0 < self.clip_epsilon < 10, f"{p}.clip_epsilon", self.clip_epsilon, "in (0, 10)")
         require(self.max_gradient_norm > 0, f"{p}.max_gradient_norm", self.max_gradient_norm, "positive")
         require(self.reward_scale > 0, f"{p}.reward_scale", self.reward_scale, "positive")

@@ -80,7 +80,7 @@ _CNN: dict[str, Any] = {"initial_turn": 0.6}
 _NO_ROCKS: dict[str, Any] = {"random_num_rocks_max": 0, "collision_margin_m": 0.0, "rocks": None}
 _BY_ARCH: dict[tuple[str, str], dict[str, Any]] = {
     # Longer training only swings: seed 0 had 96.5 % among 32 rocks after 163,840 decisions, and 85 to 93 % later.
-    ("cpu", "cnn"): _CNN | {"steps": 163_840, "every_decisions": 20_480, "average_decay": 0.8},
+    ("cpu", "cnn"): _CNN | {"steps": 163_840, "every_decisions": 20_480},
     ("gpu", "cnn"): _CNN,
     ("cpu", "mlp_rocks"): _CPU_STATE,
     # It sees no rocks, so that more of them, or wider ones, would only be noise.

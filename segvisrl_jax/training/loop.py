@@ -93,9 +93,7 @@ class Trainer:
         params_key, act_key, update_key = keys
         learner = jax.jit(self.learner.init)(params_key)
         if params is not None:
-            params = jax.tree.map(jnp.asarray, params)
-            average = None if learner.average is None else params
-            learner = dataclasses.replace(learner, params=params, average=average)
+            learner = dataclasses.replace(learner, params=jax.tree.map(jnp.asarray, params))
         actor = jax.jit(lambda key: start_acting(key, self.batch, self.network))(act_key)
         return TrainingState(learner, actor, update_key)
 
@@ -229,12 +227,12 @@ class _Session:
         return {"time/seconds": host.seconds, "time/decisions_per_second": decisions / seconds}
 
     def _evaluate(self, state: TrainingState, host: HostState) -> dict[str, float]:
-        summary = self.trainer.evaluate(state.learner.judged_params)
+        summary = self.trainer.evaluate(state.learner.params)
         rank = [summary["success"], -summary["collision"], summary["spl"]]
         if rank >= (host.best or rank):
             host.best = rank
             scores = {**summary, "scenes": "validation", "decisions": self._decisions(host)}
-            save_policy(self.run_dir / "policy", self.config, state.learner.judged_params, scores)
+            save_policy(self.run_dir / "policy", self.config, state.learner.params, scores)
         low, high = summary.pop("success_ci95")
         kept = {k: v for k, v in summary.items() if isinstance(v, float)}
         kept |= {"success_low": low, "success_high": high}

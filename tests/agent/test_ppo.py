@@ -302,27 +302,6 @@ def test_a_step_that_is_not_finite_is_skipped_and_counted(execution: str) -> Non
     assert_equal(new_state.opt_state, state.opt_state)
 
 
-@pytest.mark.parametrize("execution", ["host", "fused"])
-def test_the_average_follows_the_parameters_and_does_not_change_them(execution: str) -> None:
-    _, trajectory = rollout("mlp")
-    averaging, plain = (
-        make_learner(built("mlp"), dataclasses.replace(CONFIG, average_decay=decay), TOTAL_UPDATES, execution)
-        for decay in (0.75, 0.0)
-    )
-    state, other = (learner.init(jax.random.key(0)) for learner in (averaging, plain))
-    assert other.average is None
-    assert other.judged_params is other.params
-    assert_equal(state.judged_params, state.params)
-    expected = leaves(state.params)
-    for _ in range(2):
-        state, _ = update(averaging, state, trajectory)
-        other, _ = update(plain, other, trajectory)
-        expected = [0.75 * old + 0.25 * new for old, new in zip(expected, leaves(state.params), strict=True)]
-    assert_equal(state.params, other.params)
-    for leaf, by_hand in zip(leaves(state.judged_params), expected, strict=True):
-        np.testing.assert_allclose(leaf, by_hand, rtol=1e-5, atol=1e-7)
-
-
 def test_update_compiles_once() -> None:
     state, trajectory = rollout("mlp")
     learner = learner_of("mlp", "fused")
