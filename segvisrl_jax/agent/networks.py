@@ -47,6 +47,11 @@ def has_memory(arch: Arch) -> bool:
     return arch.startswith("cnn_lstm")
 
 
+def mean_reach(config: NetworkConfig) -> float:
+    """How far a bounded mean can be from half speed."""
+    return HALF_RANGE + config.mean_overshoot
+
+
 def has_convolutions(arch: Arch) -> bool:
     """Whether the architecture looks at images."""
     return ARCH_OBSERVATION[arch] in IMAGE_OBSERVATIONS
@@ -142,7 +147,7 @@ class ActorCritic(nn.Module):
 
     def _heads(self, features: Float32[Array, "*B F"]) -> PolicyOutput:
         free_mean = self.policy_head(features)
-        deviation = HALF_RANGE * jnp.tanh(free_mean) if self.config.bounded_mean else free_mean
+        deviation = mean_reach(self.config) * jnp.tanh(free_mean) if self.config.bounded_mean else free_mean
         mean = MIDDLE_SPEED + deviation
         log_std = jnp.clip(self.log_std, math.log(MIN_STD), math.log(MAX_STD))
         return PolicyOutput(mean, log_std, self.value_head(features)[..., 0])
@@ -228,7 +233,7 @@ def _make_body(arch: Arch, config: NetworkConfig) -> MLP | ImpalaCNN:
 def _initial_bias(config: NetworkConfig) -> nn.initializers.Initializer:
     """Of the policy's head, so that left and right wheel begin ``initial_turn`` apart, around half speed."""
     half = config.initial_turn / 2
-    free = math.atanh(half / HALF_RANGE) if config.bounded_mean else half
+    free = math.atanh(half / mean_reach(config)) if config.bounded_mean else half
     return lambda key, shape, dtype=jnp.float32: jnp.array([-free, free], dtype)
 
 

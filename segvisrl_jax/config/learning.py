@@ -23,6 +23,8 @@ class NetworkConfig:
     """Hidden layers of the architectures mlp and mlp_rocks."""
     bounded_mean: bool = True
     """The Gaussian's mean is squashed to the wheels' range [0, 1]; else it is free."""
+    mean_overshoot: float = 0.0
+    """How far beyond that range the squashed mean may go, so that it is not saturated at full speed and none."""
     initial_std: float = 0.25
     """Standard deviation of the action at the start, as a share of the top speed."""
     initial_turn: float = 0.0
@@ -40,6 +42,7 @@ class NetworkConfig:
         require(1 <= self.feature_size <= 8192, f"{p}.feature_size", self.feature_size, "in [1, 8192]")
         require(1 <= self.lstm_size <= 8192, f"{p}.lstm_size", self.lstm_size, "in [1, 8192]")
         require(0 < self.initial_std <= 10, f"{p}.initial_std", self.initial_std, "in (0, 10]")
+        require(0 <= self.mean_overshoot <= 1, f"{p}.mean_overshoot", self.mean_overshoot, "in [0, 1]")
         require(-1 < self.initial_turn < 1, f"{p}.initial_turn", self.initial_turn, "in (-1, 1)")
 
 

@@ -12,7 +12,7 @@ from onnx import helper, numpy_helper
 
 from segvisrl_jax.agent.convolution import POOL_STRIDE, POOL_WINDOW, WINDOW
 from segvisrl_jax.agent.memory import GATES
-from segvisrl_jax.agent.networks import HALF_RANGE, MIDDLE_SPEED, PIXEL_MAX
+from segvisrl_jax.agent.networks import MIDDLE_SPEED, PIXEL_MAX, mean_reach
 from segvisrl_jax.config import NetworkConfig
 from segvisrl_jax.export.step import CARRY_NAMES
 
@@ -131,8 +131,8 @@ def act(graph: Graph, features: str, config: NetworkConfig) -> str:
     """The policy's head: the mean of the action, clipped to [0, 1], (1, 2)."""
     deviation = graph.dense(features, "policy_head")
     if config.bounded_mean:
-        half = graph.constant("half_range", HALF_RANGE)
-        deviation = graph.add("Mul", graph.add("Tanh", deviation), half)
+        reach = graph.constant("mean_reach", mean_reach(config))
+        deviation = graph.add("Mul", graph.add("Tanh", deviation), reach)
     mean = graph.add("Add", deviation, graph.constant("middle_speed", MIDDLE_SPEED))
     bounds = graph.constant("slowest", 0.0), graph.constant("fastest", 1.0)
     return graph.add("Clip", mean, *bounds, named=ACTION)

@@ -185,7 +185,7 @@ def draw_success_curves(evaluations: Sequence[Evaluation], name: str, path_png: 
             place = axes.transData + ScaledTranslation(aside, 0, figure.dpi_scale_trans)
             ends.append(_draw_line(axes, line, kind, colour, values, place))
         axes.set_title(title, loc="left", fontsize=11)
-        axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0))
         clear_frame(axes)
     intervals = {kind: _intervals(lines, kind) for kind in ("success", "collision")}
     panels[0].set_ylim((0.5, 1.01) if intervals["success"].min() > 0.5 else (-0.02, 1.02))

@@ -218,15 +218,15 @@ def test_policy_starts_at_half_speed_with_the_set_deviation() -> None:
     np.testing.assert_allclose(np.exp(output.log_std), 0.25, rtol=1e-6)
 
 
-@pytest.mark.parametrize("bounded", [True, False])
-def test_mean_is_bounded_only_where_asked(bounded: bool) -> None:
-    config = NetworkConfig(mlp_sizes=(8,), bounded_mean=bounded)
+@pytest.mark.parametrize(("bounded", "overshoot"), [(True, 0.0), (True, 0.2), (False, 0.0)])
+def test_mean_is_bounded_only_where_asked(bounded: bool, overshoot: float) -> None:
+    config = NetworkConfig(mlp_sizes=(8,), bounded_mean=bounded, mean_overshoot=overshoot)
     network = make_network("mlp", config, (3,))
     params = network.init(jax.random.key(0))
     params["params"]["policy_head"]["bias"] = jnp.asarray([-5.0, 0.2])
     _, output = step(network, params, (), jnp.zeros((1, 3)), jnp.zeros(1))
     free = np.array([-5.0, 0.2])
-    expected = 0.5 + 0.5 * np.tanh(free) if bounded else 0.5 + free
+    expected = 0.5 + (0.5 + overshoot) * np.tanh(free) if bounded else 0.5 + free
     np.testing.assert_allclose(output.mean[0], expected, atol=1e-6)
 
 
@@ -272,9 +272,12 @@ def test_what_cannot_be_built_is_refused(arch: str, shape: tuple[int, ...], fiel
         make_network(arch, SMALL, shape)
 
 
-@pytest.mark.parametrize(("turn", "bounded"), [(0.6, True), (-0.4, True), (0.6, False), (0.0, True)])
-def test_a_fresh_policy_turns_as_it_is_told(turn, bounded):
-    network = make_network("mlp", NetworkConfig(initial_turn=turn, bounded_mean=bounded), (7,))
+@pytest.mark.parametrize(
+    ("turn", "settings"),
+    [(0.6, {}), (-0.4, {}), (0.6, {"mean_overshoot": 0.1}), (0.6, {"bounded_mean": False}), (0.0, {})],
+)
+def test_a_fresh_policy_turns_as_it_is_told(turn, settings):
+    network = make_network("mlp", NetworkConfig(initial_turn=turn, **settings), (7,))
     params = network.init(jax.random.key(0))
     _, output = network.step(params, (), jnp.zeros((1, 7)), jnp.ones(1))
     np.testing.assert_allclose(output.mean[0], [0.5 - turn / 2, 0.5 + turn / 2], atol=1e-5)

@@ -32,7 +32,7 @@ def random_step(arch, shape, **settings):
         ("cnn_lstm_raw", (7, 5, 3), {"blocks_per_stage": 2}),
         ("cnn", (4, 10, 3), {"channels": (3, 5, 4), "blocks_per_stage": 0}),
         ("cnn", (6, 7, 3), {"bounded_mean": False}),
-        ("mlp", (7,), {"mlp_sizes": (8,)}),
+        ("mlp", (7,), {"mlp_sizes": (8,), "mean_overshoot": 0.1}),
         ("mlp_rocks", (31,), {"bounded_mean": False}),
     ],
 )
