@@ -60,6 +60,9 @@ def test_only_what_has_no_memory_turns_before_training():
     turns = {arch: preset_config(arch, "cpu").network.initial_turn for arch in ARCHS}
     assert turns.pop("cnn") > 0
     assert set(turns.values()) == {0}
+    lambdas = {arch: preset_config(arch, "cpu").ppo.gae_lambda for arch in ARCHS}
+    assert lambdas.pop("cnn") == 1
+    assert set(lambdas.values()) == {0.95}
 
 
 def test_most_rocks_must_fit_and_have_shapes():
