@@ -76,8 +76,8 @@ _CPU_STATE: dict[str, Any] = {
 }
 # Without memory it must keep turning the same way until the goal is in view: it does so from the start, to the left,
 # and has no reason to unlearn it. From a mean straight ahead it learns to turn back at the map's edge, and swings.
-# Its value cannot tell a goal just lost from one not yet found: with lambda below 1 the former's advantage is taken from
-# the latter's value, and it learns to turn away from the goal in front of it (SPL falls while it trains).
+# Its value cannot tell a goal just lost from one not yet found: with lambda below 1, advantages lean on that value, and
+# it learns to turn away from the goal in front of it (SPL falls while it trains).
 _CNN: dict[str, Any] = {"initial_turn": 0.6, "gae_lambda": 1.0}
 _NO_ROCKS: dict[str, Any] = {"random_num_rocks_max": 0, "collision_margin_m": 0.0, "rocks": None}
 _BY_ARCH: dict[tuple[str, str], dict[str, Any]] = {
