@@ -177,10 +177,10 @@ def test_the_runner_steps_a_file_without_jax(tmp_path):
 
 def test_the_runner_refuses_another_image(tmp_path):
     (tmp_path / "policy.onnx").write_bytes(exported("cnn", "onnx").data)
-    np.save(tmp_path / "image.npy", np.zeros((27, 48, 3), np.uint8))
+    np.save(tmp_path / "image.npy", np.zeros((14, 24, 3), np.uint8))
     done = step_without_jax(tmp_path / "policy.onnx", tmp_path / "image.npy")
     assert done.returncode == 1
-    assert done.stderr.strip().endswith("(27, 48, 3) uint8, but the policy sees (14, 24, 3) uint8")
+    assert done.stderr.strip().endswith("(14, 24, 3) uint8, but the policy sees (27, 48, 3) uint8")
     assert done.stderr.count("\n") == 1
 
 
