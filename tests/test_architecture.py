@@ -19,6 +19,7 @@ MAY_IMPORT = {  # part -> the parts it may import, besides itself
     "report": {"config", "types", "env", "vision", "training"},
     "adapters": {"config", "types", "env", "report"},
     "export": {"config", "env", "vision", "training", "agent", "report"},
+    "sweep": {"config", "training"},
     "machine": {"config", "env", "vision", "training"},
     "commands": {
         "assets",
@@ -31,6 +32,7 @@ MAY_IMPORT = {  # part -> the parts it may import, besides itself
         "report",
         "machine",
         "export",
+        "sweep",
         "cli",
     },
     "cli": {"config", "commands"},

@@ -1,117 +1,123 @@
-"""``segvisrl sweep``: one training for each combination of scale, architecture and seed; a table and a plot."""
+"""``segvisrl sweep``: one training for each combination of settings; a table and a plot."""
 
-import csv
-import itertools
-import json
-import subprocess
+import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from segvisrl_jax.cli import parse
-from segvisrl_jax.config import Arch, PresetName, preset_config, replace_fields, require
+from segvisrl_jax.config import PresetName, require
 
-COLUMNS = (
-    "arch",
-    "scale",
-    "seed",
-    "status",
-    "success",
-    "success_low",
-    "success_high",
-    "collision",
-    "timeout",
-    "spl",
-    "decisions_per_second",
-)
 FAILURE = 1
+STOPPED = 130  # the exit code of a training that Ctrl-C stopped
 
 
 @dataclass(frozen=True)
 class SweepOptions:
-    """Trains every combination in a process of its own; finished ones are not run again, failed ones are reported."""
+    """Trains every combination in a process of its own. Finished runs are not run again, stopped ones go on, failed
+    ones are reported at the end. The folder holds the runs, their logs, results.csv and sweep.png."""
 
-    scales: tuple[float, ...] = (20.0, 40.0, 60.0)
-    archs: tuple[Arch, ...] = ("cnn_lstm",)
-    seeds: tuple[int, ...] = (0,)
+    vary: tuple[str, ...] = ("scale=20,40,60", "arch=cnn_lstm", "seed=0")
+    """FIELD=VALUE,VALUE for any option of ``segvisrl train``, whole or by its last part:
+    --vary scale=20,40 arch=cnn,cnn_lstm seed=0,1,2 discount=0.95,0.97"""
     preset: PresetName = "cpu"
     steps: int | None = None
     """Training decisions of each run; default: the preset's."""
     output: Path = Path("runs/sweep")
-    """Folder of the runs, results.csv and success_by_scale.png."""
     args: str = ""
     """More options of ``segvisrl train`` for every run, in one string."""
+    engine: Literal["local", "ray"] = "local"
+    """local: processes on this machine; ray: the nodes of a Ray cluster (extra [ray])."""
+    jobs: int = 1
+    """local: how many runs at a time."""
+    ray_address: str = "auto"
+    """ray: the cluster; auto: the one this machine belongs to."""
+    cpus_per_run: float = 2.0
+    """ray: cores that a run takes of its node."""
+    gpus_per_run: float = 0.0
+    """ray: GPUs that a run takes of its node; 0.25 lets four runs share one."""
 
     def __post_init__(self) -> None:
-        for name in ("scales", "archs", "seeds"):
-            require(len(getattr(self, name)) > 0, f"--{name}", getattr(self, name), "at least one value")
-        for arch, scale in itertools.product(self.archs, self.scales):
-            replace_fields(preset_config(arch, self.preset), scale=scale)
+        require(1 <= self.jobs <= 1024, "--jobs", self.jobs, "in [1, 1024]")
+        require(self.steps is None or self.steps > 0, "--steps", self.steps, "above 0")
+        require(0 < self.cpus_per_run <= 4096, "--cpus-per-run", self.cpus_per_run, "in (0, 4096]")
+        require(0 <= self.gpus_per_run <= 64, "--gpus-per-run", self.gpus_per_run, "in [0, 64]")
 
 
 def run(options: Sequence[str]) -> int:
-    """Parses, trains one after another, writes table and plot."""
+    """Parses, checks every trial, trains what is missing, writes table and plot."""
+    from segvisrl_jax.commands.train import parse_config
+    from segvisrl_jax.sweep.plan import Trial, check_trials, parse_axis, plan_trials
+    from segvisrl_jax.sweep.results import DONE, in_words, result_row, write_csv
+
     asked = parse(SweepOptions, options, "sweep")
+    words = ["--preset", asked.preset, *(["--steps", str(asked.steps)] if asked.steps else [])]
+    trials = plan_trials([parse_axis(text) for text in asked.vary], [*words, *shlex.split(asked.args)])
+    check_trials(trials, asked.output, parse_config)
     asked.output.mkdir(parents=True, exist_ok=True)
-    combinations = list(itertools.product(asked.archs, asked.scales, asked.seeds))
-    rows = []
-    for number, (arch, scale, seed) in enumerate(combinations, start=1):
-        print(f"[{number}/{len(combinations)}] {arch}, scale {scale:g}, seed {seed}", flush=True)
-        rows.append(_train_one(asked, arch, scale, seed))
-        _write_table(asked.output / "results.csv", rows)
-    return _report(asked, rows)
+    found: dict[str, dict[str, Any]] = {}
+
+    def note(trial: Trial, status: str, node: str) -> str:
+        found[trial.name] = result_row(trial, asked.output / trial.name, status, node)
+        known = [other for other in trials if other.name in found]
+        write_csv(asked.output / "results.csv", known, [found[other.name] for other in known])
+        return in_words(trial, found[trial.name])
+
+    missing = [trial for trial in trials if not _is_finished(asked.output / trial.name)]
+    for trial in trials:
+        if trial not in missing:
+            print(f"  {note(trial, DONE, '')} (already there)")
+    _train(asked, missing, note)
+    return _report(asked, [found[trial.name] for trial in trials])
 
 
-def _train_one(asked: SweepOptions, arch: str, scale: float, seed: int) -> dict[str, Any]:
-    name = f"{arch}-scale{scale:g}-seed{seed}"
-    run_dir = asked.output / name
-    row: dict[str, Any] = {"arch": arch, "scale": scale, "seed": seed}
-    if not (run_dir / "eval.json").is_file():
-        words = [sys.executable, "-m", "segvisrl_jax.cli", "train", "--run", name, "--runs-dir", str(asked.output)]
-        if (run_dir / "config.json").is_file():
-            words.append("--resume")
-        else:
-            words += ["--arch", arch, "--preset", asked.preset, "--seed", str(seed), "--env.camera.scale", str(scale)]
-            words += ["--steps", str(asked.steps)] if asked.steps else []
-            words += asked.args.split()
-        with (asked.output / f"{name}.log").open("a") as log:
-            code = subprocess.run(words, stdout=log, stderr=subprocess.STDOUT, check=False).returncode
-        if code < 0 or code == 130:
-            raise KeyboardInterrupt
-        if code:
-            return {**row, "status": f"failed ({code})"}
-    return {**row, "status": "done", **_scores(run_dir)}
+def _is_finished(run_dir: Path) -> bool:
+    return (run_dir / "eval.json").is_file()
 
 
-def _scores(run_dir: Path) -> dict[str, Any]:
-    from segvisrl_jax.training.metrics import read_metrics
+def _train(asked: SweepOptions, missing: Sequence[Any], note: Any) -> None:
+    """Runs the trials under a bar, with a line for each that ends."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    result = json.loads((run_dir / "eval.json").read_text())
-    low, high = result["success_ci95"]
-    last = read_metrics(run_dir)[-1]
-    decisions, seconds = last["step"], last["time/seconds"]
-    kept = {name: result[name] for name in ("success", "collision", "timeout", "spl")}
-    return {**kept, "success_low": low, "success_high": high, "decisions_per_second": decisions / seconds}
+    if not missing:
+        return
+    columns = (TextColumn("sweep"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns) as progress:
+        bar = progress.add_task("sweep", total=len(missing))
+        progress.console.print(f"{len(missing)} runs; logs in {asked.output}", highlight=False)
+        for trial, ended in _ends(asked, missing):
+            if ended.code in (STOPPED, -2):
+                raise KeyboardInterrupt
+            progress.console.print(f"  {note(trial, _status(asked, trial, ended), ended.node)}", highlight=False)
+            progress.advance(bar)
 
 
-def _write_table(path: Path, rows: list[dict[str, Any]]) -> None:
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows(rows)
+def _ends(asked: SweepOptions, missing: Sequence[Any]) -> Iterator[tuple[Any, Any]]:
+    from segvisrl_jax.sweep.engines import run_local, run_ray
+
+    if asked.engine == "local":
+        return run_local(missing, asked.output, asked.jobs)
+    return run_ray(missing, asked.output, asked.ray_address, asked.cpus_per_run, asked.gpus_per_run)
 
 
-def _report(asked: SweepOptions, rows: list[dict[str, Any]]) -> int:
-    from segvisrl_jax.report.figures import success_by_scale
+def _status(asked: SweepOptions, trial: Any, ended: Any) -> str:
+    from segvisrl_jax.sweep.results import DONE
+
+    if ended.code == 0 and _is_finished(asked.output / trial.name):
+        return DONE
+    return f"failed ({ended.trouble or ended.code})"
+
+
+def _report(asked: SweepOptions, rows: Sequence[dict[str, Any]]) -> int:
+    from segvisrl_jax.report.sweep_figure import sweep_figure
+    from segvisrl_jax.sweep.plan import parse_axis
 
     done = [row for row in rows if row["status"] == "done"]
-    for row in rows:
-        score = f"success {100 * row['success']:.1f} %" if row["status"] == "done" else row["status"]
-        print(f"  {row['arch']:<13} scale {row['scale']:>5g}  seed {row['seed']}  {score}")
     if done:
-        success_by_scale(done, asked.output / "success_by_scale.png")
+        labels = [parse_axis(text).label for text in asked.vary]
+        print(f"  {sweep_figure(done, labels, asked.output / 'sweep.png')}")
     print(f"  {asked.output / 'results.csv'}")
     failed = len(rows) - len(done)
     if failed:

@@ -1,4 +1,4 @@
-"""Curves of runs as PNG files: how they learnt, and what a sweep found.
+"""Curves of runs as PNG files: how they learnt.
 
 Drawn with matplotlib's ``Figure`` objects, whose canvas is Agg: no display, no global state.
 Colours are those of Okabe and Ito, which colour-blind readers can tell apart. Figures of a scene
@@ -26,7 +26,6 @@ FAILURES = (  # what an episode that did not succeed ended with: key, label, col
     ("episode/fall", "fall", "#cc79a7"),
     ("episode/timeout", "timeout", "#0072b2"),
 )
-SHIFT_SHARE = 0.03  # between architectures that share a scale
 RUN_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 
 
@@ -202,47 +201,6 @@ def clear_frame(axes: Axes) -> None:
 def cycle_colours(colours: Sequence[str], count: int) -> list[str]:
     """As many colours as asked for, from the beginning again where they run out."""
     return [colours[i % len(colours)] for i in range(count)]
-
-
-def success_by_scale(rows: Sequence[Mapping[str, Any]], path_png: Path) -> Path:
-    """Draws a sweep: success on test scenes over the downsampling, one line for each architecture.
-
-    Args:
-        rows: one for each run: ``arch``, ``scale``, ``success``, ``success_low``, ``success_high``.
-        path_png: the figure.
-
-    Points are runs with their intervals, lines join the means over runs that differ only in seed.
-    """
-    require(len(rows) > 0, "rows", "none", "at least one run")
-    figure = Figure(figsize=(10, 5.6), layout="constrained")
-    axes = figure.add_subplot()
-    architectures = sorted({row["arch"] for row in rows})
-    colours = cycle_colours(RUN_COLOURS, len(architectures))
-    for index, (arch, colour) in enumerate(zip(architectures, colours, strict=True)):
-        shift = 1 + SHIFT_SHARE * (index - (len(architectures) - 1) / 2)  # side by side, not on top
-        _draw_sweep(axes, [row for row in rows if row["arch"] == arch], arch, colour, shift)
-    scales = sorted({row["scale"] for row in rows})
-    axes.set_xscale("log")
-    axes.set_xticks(scales, [f"{scale:g}" for scale in scales])
-    axes.minorticks_off()
-    axes.margins(x=0.08)
-    axes.set(xlabel="downsampling per axis", ylabel="success rate on test scenes", ylim=(-0.02, 1.02))
-    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-    clear_frame(axes)
-    axes.legend(loc="lower left")
-    return save_figure(figure, path_png)
-
-
-def _draw_sweep(axes: Axes, rows: Sequence[Mapping[str, Any]], arch: str, colour: str, shift: float) -> None:
-    """The runs of one architecture."""
-    scale, rate, low, high = (
-        np.array([float(row[key]) for row in rows]) for key in ("scale", "success", "success_low", "success_high")
-    )
-    errors = np.maximum(0.0, np.stack([rate - low, high - rate]))
-    axes.errorbar(scale * shift, rate, errors, fmt="o", ms=5, capsize=3, color=colour, mec="white")
-    at = np.unique(scale)
-    means = [rate[scale == value].mean() for value in at]
-    axes.plot(at * shift, means, color=colour, lw=1.8, label=arch)
 
 
 def save_figure(figure: Figure, path_png: Path, dots_per_inch: int = DOTS_PER_INCH) -> Path:

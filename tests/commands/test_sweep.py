@@ -1,13 +1,19 @@
-"""A sweep trains what is missing, leaves finished runs alone, and says what failed."""
+"""A sweep trains what is missing, leaves finished runs alone, and says what failed: here, and on a Ray cluster."""
 
 import csv
+import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-SMALL = ["--archs", "mlp", "--preset", "smoke", "--steps", "128", "--output", "sweep"]
+from segvisrl_jax.cli import main
+from segvisrl_jax.sweep.engines import pack, train_on_node, unpack
+from segvisrl_jax.sweep.plan import parse_axis, plan_trials
+
+SMALL = ("--preset", "smoke", "--steps", "128", "--args=--arch mlp", "--output", "sweep")
 
 
 def sweep(cwd, *words):
@@ -15,22 +21,110 @@ def sweep(cwd, *words):
     return subprocess.run(command, cwd=cwd, env={**os.environ, "JAX_PLATFORMS": "cpu"}, capture_output=True, text=True)
 
 
+def read_rows(folder):
+    with (folder / "sweep" / "results.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
 @pytest.mark.slow
 def test_sweep_goes_on_where_it_was_and_reports_failures(tmp_path):
-    first = sweep(tmp_path, "--scales", "120", "--seeds", "0")
-    assert first.returncode == 0, first.stderr
-    judged = tmp_path / "sweep" / "mlp-scale120-seed0" / "eval.json"
+    first = sweep(tmp_path, "--vary", "scale=120", "seed=0")
+    assert first.returncode == 0, first.stdout + first.stderr
+    judged = tmp_path / "sweep" / "scale120-seed0" / "eval.json"
     written = judged.stat().st_mtime_ns
 
-    blocked = tmp_path / "sweep" / "mlp-scale120-seed1"
+    blocked = tmp_path / "sweep" / "scale120-seed1"
     blocked.mkdir()
     (blocked / "in_the_way").write_text("not a run")
-    second = sweep(tmp_path, "--scales", "120", "--seeds", "0", "1")
+    second = sweep(tmp_path, "--vary", "scale=120", "seed=0,1", "--jobs", "2")
     assert second.returncode == 1
+    assert "already there" in second.stdout
     assert "1 of 2 runs failed" in second.stderr
     assert judged.stat().st_mtime_ns == written
-    with (tmp_path / "sweep" / "results.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = read_rows(tmp_path)
     assert [row["status"] for row in rows] == ["done", "failed (2)"]
+    assert rows[0]["scale"] == "120"
     assert 0 <= float(rows[0]["success"]) <= 1
-    assert (tmp_path / "sweep" / "success_by_scale.png").stat().st_size > 0
+    assert float(rows[0]["decisions_per_second"]) > 0
+    assert (tmp_path / "sweep" / "sweep.png").stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--vary", "scal=20"], "did you mean scale"),
+        (["--vary", "scale=20,0.1"], "scale0.1: camera.scale = 0.1: should be 1 or more"),
+        (["--jobs", "0"], "--jobs = 0: should be in [1, 1024]"),
+        (["--args=--no-such-option"], "no-such-option"),
+        (["--cpus-per-run", "0"], "--cpus-per-run"),
+    ],
+)
+def test_mistakes_are_one_line_and_leave_nothing(words, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["sweep", *words]) == 2
+    shown = capsys.readouterr().err
+    assert said in shown
+    assert shown.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_packed_folders_come_back_whole_and_stay_inside(tmp_path):
+    source, target = tmp_path / "a", tmp_path / "b"
+    (source / "run").mkdir(parents=True)
+    (source / "run" / "eval.json").write_text("{}")
+    target.mkdir()
+    unpack(pack(source), target)
+    assert (target / "run" / "eval.json").read_text() == "{}"
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A real Ray cluster: a head that runs nothing, and two worker nodes with room for one run each."""
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    for _ in range(2):
+        made.add_node(num_cpus=1)
+    yield made
+    made.shutdown()
+
+
+@pytest.mark.slow
+def test_a_cluster_of_two_nodes_trains_side_by_side(tmp_path, cluster):
+    on_ray = ("--engine", "ray", "--ray-address", cluster.address, "--cpus-per-run", "1")
+    done = sweep(tmp_path, "--vary", "scale=120", "seed=0,1", *on_ray)
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = read_rows(tmp_path)
+    assert [row["status"] for row in rows] == ["done", "done"]
+    assert len({row["node"] for row in rows}) == 2
+    assert not (tmp_path / "sweep" / ".sweep").exists()
+    again = sweep(tmp_path, "--vary", "scale=120", "seed=0,1", *on_ray)
+    assert again.returncode == 0
+    assert again.stdout.count("already there") == 2
+
+
+@pytest.mark.slow
+def test_a_node_with_another_disk_sends_its_run_back(tmp_path, cluster):
+    import ray
+
+    [trial] = plan_trials([parse_axis("seed=7")], ["--preset", "smoke", "--steps", "128", "--arch", "mlp"])
+    ray.init(address=cluster.address, log_to_driver=False, logging_level="ERROR")
+    try:
+        task = ray.remote(num_cpus=1)(train_on_node)
+        ended, packed = ray.get(task.remote(trial, "/no/such/folder", "word"))
+    finally:
+        ray.shutdown()
+    assert ended.code == 0
+    unpack(packed, tmp_path)
+    assert 0 <= json.loads((tmp_path / "seed7" / "eval.json").read_text())["success"] <= 1
+    assert (tmp_path / "seed7.log").stat().st_size > 0
+    assert not Path("/no/such/folder").exists()
+
+
+def test_no_cluster_is_said_in_one_line(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("ray")
+    monkeypatch.chdir(tmp_path)
+    words = ["sweep", *SMALL, "--vary", "seed=0", "--engine", "ray", "--ray-address", "127.0.0.1:1"]
+    assert main(words) == 2
+    assert "a Ray cluster that answers" in capsys.readouterr().err

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from segvisrl_jax.config import ConfigError
-from segvisrl_jax.report.figures import learning_curve, running_mean, success_by_scale
+from segvisrl_jax.report.figures import learning_curve, running_mean
 from segvisrl_jax.report.layout import DrivenPath, SceneMap
 from segvisrl_jax.report.scene_figures import preprocessing, trajectories
 from segvisrl_jax.types import Outcome
@@ -90,27 +90,6 @@ def test_running_mean_keeps_constants_and_is_the_mean_of_its_window():
     assert smoothed[500] == pytest.approx(values[490:511].mean())
     assert smoothed[0] == pytest.approx(values[:11].mean())
     np.testing.assert_array_equal(running_mean(np.array([1.0, 5.0])), [1, 5])
-
-
-def test_success_by_scale(tmp_path, drawn):
-    rows = [
-        {"arch": arch, "scale": scale, "seed": seed, "success": rate, "success_low": rate - 0.1}
-        | {"success_high": min(1.0, rate + 0.1)}
-        for arch, scale, seed, rate in [
-            ("cnn", 10.0, 0, 0.6),
-            ("cnn", 10.0, 1, 0.8),
-            ("cnn", 40.0, 0, 0.5),
-            ("cnn_lstm", 10.0, 0, 0.9),
-        ]
-    ]
-    assert iio.imread(success_by_scale(rows, tmp_path / "sweep.png")).shape[1] >= 1000
-    axes = drawn[0].axes[0]
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["cnn", "cnn_lstm"]
-    means = next(line for line in axes.lines if line.get_label() == "cnn")
-    np.testing.assert_allclose(means.get_ydata(), [0.7, 0.5])
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["10", "40"]
-    with pytest.raises(ConfigError, match="rows"):
-        success_by_scale([], tmp_path / "sweep.png")
 
 
 def scene_map(rocks=((1.0, 2.0), (-3.0, 0.5))):

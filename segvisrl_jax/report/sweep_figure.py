@@ -1,0 +1,95 @@
+"""A sweep as a figure: success and speed over one setting, one line for each combination of the others."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, PercentFormatter
+
+from segvisrl_jax.config import require
+from segvisrl_jax.report.figures import RUN_COLOURS, clear_frame, cycle_colours, save_figure
+
+SEED = "seed"  # runs that differ in nothing else are averaged
+SHIFT_SHARE = 0.12  # of the distance between neighbours on the axis: lines stand side by side, not on top of each other
+
+
+def sweep_figure(rows: Sequence[Mapping[str, Any]], varied: Sequence[str], path_png: Path) -> Path:
+    """Draws success on test scenes, and training speed, over the first varied setting that has numbers.
+
+    Args:
+        rows: one for each finished run: a text for each varied setting, ``success``, ``success_low``,
+            ``success_high`` (shares) and ``decisions_per_second``.
+        varied: the settings' names. Those that are not on the axis and not ``seed`` make the lines.
+        path_png: the figure.
+
+    Points are runs (success with its Wilson 95 % interval), lines join the medians over seeds.
+
+    Raises:
+        ConfigError: without rows.
+    """
+    require(len(rows) > 0, "rows", "none", "at least one finished run")
+    over = _axis(rows, varied)
+    ticks = sorted({row[over] for row in rows}, key=_sort_key)
+    others = [name for name in varied if name not in (over, SEED)]
+    groups = sorted({tuple(row[name] for name in others) for row in rows}, key=lambda group: [*map(_sort_key, group)])
+    figure = Figure(figsize=(11, 4.8), layout="constrained")
+    success, speed = figure.subplots(1, 2)
+    for index, (group, colour) in enumerate(zip(groups, cycle_colours(RUN_COLOURS, len(groups)), strict=True)):
+        members = [row for row in rows if tuple(row[name] for name in others) == group]
+        at = np.array([ticks.index(row[over]) for row in members]) + SHIFT_SHARE * (index - (len(groups) - 1) / 2)
+        label = ", ".join(_named(name, value) for name, value in zip(others, group, strict=True))
+        _draw_success(success, members, at, colour)
+        _draw_line(speed, at, np.array([row["decisions_per_second"] for row in members]), colour, label)
+    for axes in (success, speed):
+        axes.set_xticks(range(len(ticks)), ticks)
+        axes.margins(x=0.08)
+        axes.set_xlabel(over)
+        clear_frame(axes)
+    success.set(ylabel="success rate on test scenes", ylim=(-0.02, 1.02))
+    success.yaxis.set_major_formatter(PercentFormatter(1.0))
+    speed.set(ylabel="training decisions/s", ylim=(0, None))
+    speed.yaxis.set_major_formatter(EngFormatter())
+    if others:
+        speed.legend(loc="best", fontsize=9)
+    return save_figure(figure, path_png)
+
+
+def _axis(rows: Sequence[Mapping[str, Any]], varied: Sequence[str]) -> str:
+    """The setting on the horizontal axis: the first with several numbers, else with several values, else the first."""
+    several = [name for name in varied if name != SEED and len({row[name] for row in rows}) > 1]
+    numbers = [name for name in several if all(_is_number(row[name]) for row in rows)]
+    return [*numbers, *several, *varied][0]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _sort_key(text: str) -> tuple[float, str]:
+    return (float(text), "") if _is_number(text) else (np.inf, text)
+
+
+def _named(name: str, value: str) -> str:
+    return f"{name} {value}" if _is_number(value) else value
+
+
+def _draw_success(axes: Axes, rows: Sequence[Mapping[str, Any]], at: np.ndarray, colour: str) -> None:
+    rate, low, high = (
+        np.array([float(row[key]) for row in rows]) for key in ("success", "success_low", "success_high")
+    )
+    errors = np.maximum(0.0, np.stack([rate - low, high - rate]))
+    axes.errorbar(at, rate, errors, fmt="none", capsize=3, color=colour)
+    _draw_line(axes, at, rate, colour, "")
+
+
+def _draw_line(axes: Axes, at: np.ndarray, values: np.ndarray, colour: str, label: str) -> None:
+    axes.plot(at, values, "o", ms=5, color=colour, mec="white")
+    places = np.unique(at)
+    axes.plot(places, [np.median(values[at == place]) for place in places], color=colour, lw=1.8, label=label)

@@ -1,0 +1,1 @@
+"""Sweeps: which trainings there are (``plan``), who runs them (``engines``), what came out (``results``)."""

@@ -1,0 +1,43 @@
+"""What a sweep found: one row for each trial, as a CSV file and in words."""
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from segvisrl_jax.sweep.plan import Trial
+from segvisrl_jax.training.metrics import read_metrics
+
+SCORES = ("success", "success_low", "success_high", "collision", "fall", "timeout", "spl", "decisions_per_second")
+DONE = "done"
+
+
+def result_row(trial: Trial, run_dir: Path, status: str, node: str) -> dict[str, Any]:
+    """A trial's row: its values, its status, where it ran, and its scores on test scenes if it is done."""
+    row: dict[str, Any] = {**trial.values, "status": status, "node": node}
+    return {**row, **_scores(run_dir)} if status == DONE else row
+
+
+def _scores(run_dir: Path) -> dict[str, float]:
+    result = json.loads((run_dir / "eval.json").read_text())
+    low, high = result["success_ci95"]
+    last = read_metrics(run_dir)[-1]
+    speed = last["step"] / last["time/seconds"]
+    kept = {name: result[name] for name in SCORES if name in result}
+    return {**kept, "success_low": low, "success_high": high, "decisions_per_second": speed}
+
+
+def write_csv(path: Path, trials: Sequence[Trial], rows: Sequence[dict[str, Any]]) -> None:
+    """The table of runs, in the order of the plan; what a run has no number for stays empty."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [*trials[0].values, "status", "node", *SCORES])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def in_words(trial: Trial, row: dict[str, Any]) -> str:
+    """One line about a trial."""
+    if row["status"] != DONE:
+        return f"{trial.name}: {row['status']}"
+    return f"{trial.name}: success {100 * row['success']:.1f} %, {row['decisions_per_second']:,.0f} decisions/s"
