@@ -7,6 +7,7 @@ import contextlib
 import ctypes
 import importlib
 import io
+import os
 import re
 import sys
 from collections.abc import Sequence
@@ -21,13 +22,14 @@ COMMANDS = {
     "report": "one self-contained HTML page about one or several runs",
     "demo": "let a policy drive one scene and write a video",
     "export": "write a policy as a file that other programs can run: ONNX or StableHLO",
-    "sweep": "train over scales, architectures and seeds; a table and a plot",
+    "sweep": "train over the values of any settings, here or on a Ray cluster; a table and a plot",
     "bench": "measure physics, rendering and learning on this machine",
     "runs": "list the runs in a folder: how far they are, how well they drive",
     "doctor": "say whether this machine can do the work, how fast, and what to mend",
 }
 USAGE_ERROR = 2
 INTERRUPTED = 130
+READER_GONE = 141  # what a shell gives for SIGPIPE: the output went to `head`, which had enough
 OptionsT = TypeVar("OptionsT")
 
 
@@ -49,13 +51,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     _keep_freed_memory()
     try:
         module = importlib.import_module(f"segvisrl_jax.commands.{command}")
-        return module.run(options)
+        code = module.run(options)
+        sys.stdout.flush()
+        return code
     except ConfigError as error:
         print(f"segvisrl {command}: {error}", file=sys.stderr)
         return USAGE_ERROR
     except KeyboardInterrupt:
         print(f"\nsegvisrl {command}: interrupted", file=sys.stderr)
         return INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more when it ends
+        return READER_GONE
 
 
 def _keep_freed_memory() -> None:

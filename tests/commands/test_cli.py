@@ -50,7 +50,7 @@ def segvisrl(*words, cwd):
         (["bench", "fly"], ["fly", "physics"]),
         (["bench", "render", "--batches", "0"], ["--batches", "0"]),
         (["bench", "render", "--json", "no/such/folder/x.json"], ["--json", "folder that exists"]),
-        (["sweep", "--scales", "900"], ["scale", "900", "at least 4 pixels"]),
+        (["sweep", "--vary", "scale=900"], ["scale", "900", "at least 4 pixels"]),
     ],
 )
 def test_a_mistake_gets_exit_code_2_and_one_line(words, says, tmp_path):
@@ -68,6 +68,15 @@ def test_help_lists_the_commands_and_their_options(tmp_path):
     options = segvisrl("train", "--help", cwd=tmp_path)
     assert options.returncode == 0
     assert "--env.camera.scale" in options.stdout
+
+
+def test_a_reader_that_has_had_enough_is_no_failure(tmp_path):
+    command = [sys.executable, "-m", "segvisrl_jax.cli", "train", "--help"]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process.stdout.close()
+    said = process.stderr.read()
+    assert process.wait(60) == 141
+    assert said == ""
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from segvisrl_jax.cli import main
 from segvisrl_jax.sweep.engines import pack, train_on_node, unpack
 from segvisrl_jax.sweep.plan import parse_axis, plan_trials
 
-SMALL = ("--preset", "smoke", "--steps", "128", "--args=--arch mlp", "--output", "sweep")
+SMALL = ("--preset", "smoke", "--steps", "128", "--args=--arch mlp --evaluation.episodes 1", "--output", "sweep")
 
 
 def sweep(cwd, *words):
@@ -108,7 +108,9 @@ def test_a_cluster_of_two_nodes_trains_side_by_side(tmp_path, cluster):
 def test_a_node_with_another_disk_sends_its_run_back(tmp_path, cluster):
     import ray
 
-    [trial] = plan_trials([parse_axis("seed=7")], ["--preset", "smoke", "--steps", "128", "--arch", "mlp"])
+    [trial] = plan_trials(
+        [parse_axis("seed=7")], ["--preset", "smoke", "--steps", "128", "--arch", "mlp", "--evaluation.episodes", "1"]
+    )
     ray.init(address=cluster.address, log_to_driver=False, logging_level="ERROR")
     try:
         task = ray.remote(num_cpus=1)(train_on_node)
