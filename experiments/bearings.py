@@ -18,9 +18,7 @@ from segvisrl_jax.cli import parse
 from segvisrl_jax.commands.table import read_evaluation
 from segvisrl_jax.config import require
 from segvisrl_jax.report.bearing_figure import bearing_line, draw_bearings, goal_bearing_deg, path_share
-from segvisrl_jax.report.script import run_script
-
-IS_SCRIPT = "__file__" in globals()
+from segvisrl_jax.report.script import run_script, show
 
 
 # %%
@@ -49,7 +47,7 @@ def work(asked: BearingOptions) -> None:
         success = " | ".join(percent(arrived[side]) for side in sides)
         paths = " | ".join(percent(share[side & arrived]) for side in sides)
         print(f"| {bearing_line(evaluation).name} | success | {success} |\n| | shortest over driven path | {paths} |")
-    print(draw_bearings(evaluations, asked.output))
+    show(draw_bearings(evaluations, asked.output))
 
 
 def percent(values: np.ndarray) -> str:
@@ -57,5 +55,4 @@ def percent(values: np.ndarray) -> str:
 
 
 # %%
-if IS_SCRIPT:
-    run_script(BearingOptions, work, parse)
+run_script(BearingOptions, work, parse, in_notebook="docs/results/cnn_lstm-s0-r4.json docs/results/cnn-s0-r4.json")

@@ -21,11 +21,9 @@ import tyro
 from segvisrl_jax.cli import parse
 from segvisrl_jax.commands.table import read_evaluation
 from segvisrl_jax.config import require
-from segvisrl_jax.report.script import run_script
+from segvisrl_jax.report.script import run_script, show
 from segvisrl_jax.report.success_curves import draw_success_curves, lines_of, resolve_field
 from segvisrl_jax.report.table import Evaluation
-
-IS_SCRIPT = "__file__" in globals()
 
 
 # %%
@@ -57,7 +55,7 @@ def work(asked: CurvesOptions) -> None:
             shares = " | ".join(share(median, kind) for kind in ("success", "collision"))
             print(f"| {line.name} | {value:g} | {median.episodes:,} | {len(seeds)} | {shares} |")
     name = field.rpartition(".")[2]
-    print(draw_success_curves(evaluations, field, asked.output or Path(f"docs/images/curve_{name}.png")))
+    show(draw_success_curves(evaluations, field, asked.output or Path(f"docs/images/curve_{name}.png")))
 
 
 def share(evaluation: Evaluation, kind: str) -> str:
@@ -66,5 +64,9 @@ def share(evaluation: Evaluation, kind: str) -> str:
 
 
 # %%
-if IS_SCRIPT:
-    run_script(CurvesOptions, work, parse)
+run_script(
+    CurvesOptions,
+    work,
+    parse,
+    in_notebook="docs/results/p-r4.json docs/results/p-r16.json docs/results/p-r32.json --x num_rocks",
+)

@@ -22,11 +22,9 @@ from segvisrl_jax.env.wrappers import TEST_STREAM, scene_stream
 from segvisrl_jax.report.episode import drive_episodes
 from segvisrl_jax.report.gallery import Failure, choose_failures, draw_failures, failures_title
 from segvisrl_jax.report.layout import OUTCOME_NAMES
-from segvisrl_jax.report.script import driver_name, driver_options, run_script
+from segvisrl_jax.report.script import driver_name, driver_options, run_script, show
 from segvisrl_jax.training.metrics import ProgressDisplay
 from segvisrl_jax.types import Outcome
-
-IS_SCRIPT = "__file__" in globals()
 
 
 # %%
@@ -68,7 +66,7 @@ def work(asked: FailuresOptions) -> None:
         title = failures_title(name, failures, asked.episodes, len(shown))
         print_table(title, failures)
         path = asked.output if len(asked.policies) == 1 else named(asked.output, word)
-        print(draw_failures(env, shown, title, path))
+        show(draw_failures(env, shown, title, path))
 
 
 def named(path: Path, word: str) -> Path:
@@ -101,5 +99,4 @@ def scene_has_rocks(episode) -> bool:
 
 
 # %%
-if IS_SCRIPT:
-    run_script(FailuresOptions, work, parse)
+run_script(FailuresOptions, work, parse)

@@ -18,9 +18,7 @@ import tyro
 from segvisrl_jax.cli import parse
 from segvisrl_jax.config import require
 from segvisrl_jax.report.learning_curves import Curve, draw_learning_curves, methods_of, read_curves, write_curves
-from segvisrl_jax.report.script import run_script
-
-IS_SCRIPT = "__file__" in globals()
+from segvisrl_jax.report.script import run_script, show
 
 
 # %%
@@ -45,7 +43,7 @@ def work(asked: LearningCurvesOptions) -> None:
         print(row(name, group))
     numbers = write_curves(curves, asked.output.with_suffix(".csv"))
     print(numbers)
-    print(draw_learning_curves(read_curves([numbers]), asked.output))  # from the file: the same picture later on
+    show(draw_learning_curves(read_curves([numbers]), asked.output))  # from the file: the same picture later on
 
 
 def row(name: str, group: list[Curve]) -> str:
@@ -58,5 +56,4 @@ def row(name: str, group: list[Curve]) -> str:
 
 
 # %%
-if IS_SCRIPT:
-    run_script(LearningCurvesOptions, work, parse)
+run_script(LearningCurvesOptions, work, parse, in_notebook="docs/images/learning_curves.csv")

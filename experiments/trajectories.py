@@ -25,11 +25,9 @@ from segvisrl_jax.env.wrappers import TEST_STREAM, scene_stream
 from segvisrl_jax.report.cases import Case, Method, draw_cases, find_cases
 from segvisrl_jax.report.episode import drive_episodes, scene_map
 from segvisrl_jax.report.layout import OUTCOME_NAMES
-from segvisrl_jax.report.script import driver_name, driver_options, run_script
+from segvisrl_jax.report.script import driver_name, driver_options, run_script, show
 from segvisrl_jax.training.metrics import ProgressDisplay
 from segvisrl_jax.training.policy import CONTROLLERS
-
-IS_SCRIPT = "__file__" in globals()
 
 
 # %%
@@ -81,7 +79,7 @@ def work(asked: TrajectoriesOptions) -> None:
     for case in cases:
         print(f"| {case.title} | {' | '.join(end_of(method, case.scene) for method in methods)} |")
     maps = [scene_map(envs[0], methods[0].episodes[case.scene].state(0).scene) for case in cases]
-    print(draw_cases(cases, maps, methods, asked.output))
+    show(draw_cases(cases, maps, methods, asked.output))
 
 
 def in_one_world(configs: Sequence[EnvConfig], asked: TrajectoriesOptions) -> list[EnvConfig]:
@@ -110,5 +108,4 @@ def end_of(method: Method, place: int) -> str:
 
 
 # %%
-if IS_SCRIPT:
-    run_script(TrajectoriesOptions, work, parse)
+run_script(TrajectoriesOptions, work, parse)

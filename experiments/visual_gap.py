@@ -34,7 +34,7 @@ from segvisrl_jax.config.conditions import AFFECTS
 from segvisrl_jax.env.rover_env import RoverEnv
 from segvisrl_jax.env.wrappers import TEST_STREAM, scene_stream
 from segvisrl_jax.report.lines import method_colours
-from segvisrl_jax.report.script import driver_name, driver_options, run_script
+from segvisrl_jax.report.script import driver_name, driver_options, run_script, show
 from segvisrl_jax.report.shift_figures import Panel, Point, View, draw_shift_panels, draw_shift_views
 from segvisrl_jax.training.evaluation import Evaluator
 from segvisrl_jax.training.metrics import ProgressDisplay
@@ -43,7 +43,6 @@ from segvisrl_jax.training.statistics import wilson_interval
 from segvisrl_jax.types import Outcome
 from segvisrl_jax.vision.resample import downsample
 
-IS_SCRIPT = "__file__" in globals()
 SLOTS = 100  # episodes that are driven side by side
 NOMINAL = "nominal"  # no shift at all
 PANE_SCALE = 3  # of the camera's image in the picture
@@ -338,11 +337,16 @@ def work(asked: VisualGapOptions) -> None:
     colours = dict(zip(names, method_colours([driver.policy.name for driver in drivers]), strict=True))
     panels = {heading: list(group.values()) for heading, group in groups.items()}
     print(record.path)
-    print(draw_shift_panels(panels, colours, asked.output))
+    show(draw_shift_panels(panels, colours, asked.output))
     views = views_of({kind: panel for group in groups.values() for kind, panel in group.items()}, drivers)
     if views:
-        print(draw_shift_views(views, asked.output.with_stem(f"{asked.output.stem}_views")))
+        show(draw_shift_views(views, asked.output.with_stem(f"{asked.output.stem}_views")))
 
 
-if IS_SCRIPT:
-    run_script(VisualGapOptions, work, parse)
+# %%
+run_script(
+    VisualGapOptions,
+    work,
+    parse,
+    in_notebook="cnn_lstm p --episodes 20 --severities 1 --kinds class-flip-share latency-s",
+)

@@ -83,6 +83,12 @@ def cluster():
     pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
 
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_worker_niceness", "0")  # 15 by default: starved by the tests beside them
+        yield from run_cluster(Cluster)
+
+
+def run_cluster(Cluster):
     made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
     for _ in range(2):
         made.add_node(num_cpus=1)
