@@ -20,7 +20,11 @@ from segvisrl_jax.config import ConfigError
 
 OPTIONAL = {"stable_baselines3": "make sb3", "onnxruntime": "the extra onnx", "onnx": "the extra onnx"}
 SMALLER = {"--episodes": "8", "--scenes": "1", "--videos": "0"}  # the options that decide how long a command runs
-TINY = {"learn(100_000)": "learn(512)", "LunarRoverVecEnv(16)": "LunarRoverVecEnv(2)"}
+TINY = {  # in this order
+    "LunarRoverVecEnv(16)).learn(100_000)": "LunarRoverVecEnv(2, scale=30), n_steps=8, batch_size=8).learn(16)",
+    "LunarRoverVecEnv(16), n_steps=64, batch_size=128": "LunarRoverVecEnv(2, scale=30), n_steps=8, batch_size=8",
+    "learn(100_000)": "learn(16)",
+}
 GIVEN = {  # what a page's reader is supposed to have
     "README.md": "import numpy\nimage = numpy.zeros((1080, 1920, 3), numpy.uint8)\n",
 }
@@ -221,6 +225,11 @@ def test_changes_to_the_sources_apply_and_work(patched: Path, name: str, workpla
     for command in commands(TEXTS[name]):
         if command.mark is not None and command.words[0] == "segvisrl":
             python("-m", "segvisrl_jax.cli", *smaller(command.words)[1:])
+
+
+def test_what_is_made_smaller_is_there():
+    for large in TINY:
+        assert any(large in text for text in TEXTS.values()), large
 
 
 def test_mistakes_are_found(workplace: Path):

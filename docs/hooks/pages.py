@@ -12,7 +12,7 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 COMMANDS_PLACE = "<!-- the help of every command -->"
-HELP_WIDTH = 100  # columns: fits the page
+HELP_WIDTH = 84  # columns: fits the page
 DIAGRAM = re.compile(r'<img alt="(?P<alt>[^"]*)" src="(?P<src>[^"]*\.svg)"[^>]*>')
 
 
@@ -27,7 +27,8 @@ def on_page_content(html: str, *, page: Any, config: Any, **_: Any) -> str:
 
     def inline(found: re.Match[str]) -> str:
         svg = (folder / found["src"]).read_text()
-        return svg.replace("<svg ", f'<svg role="img" aria-label="{found["alt"]}" class="diagram" ', 1)
+        drawn = svg.replace("<svg ", f'<svg role="img" aria-label="{found["alt"]}" ', 1)
+        return f'<span class="diagram">{drawn}</span>'
 
     return DIAGRAM.sub(inline, html)
 
