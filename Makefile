@@ -81,11 +81,11 @@ format: $(READY) ## rewrite the code in the project's format
 DOCS_READY := $(VENV)/.docs-ready
 
 docs: $(DOCS_READY) ## build the documentation site: site/index.html
-	@$(BIN)/mkdocs build --quiet --strict
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 	@echo site/index.html
 
 docs-serve: $(DOCS_READY) ## show the documentation site on http://127.0.0.1:8000, and follow changes
-	@$(BIN)/mkdocs serve
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve
 
 $(DOCS_READY): requirements-docs.lock $(READY)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-docs.lock
