@@ -17,14 +17,15 @@ from types import ModuleType
 
 ROOT = Path(__file__).parents[1]
 FENCE = re.compile(
-    r"^(?:<!-- (?P<run>run)(?:: (?P<mark>[a-z0-9 ]+?))? -->\n)?(?P<indent> *)```(?P<language>\w*)\n(?P<code>.*?)^ *```$",
+    r"^(?:<!-- (?P<run>run)(?:: (?P<mark>[a-z0-9 ]+?))? -->\n)?"
+    r"(?P<indent> *)```(?P<language>\w*)\n(?P<code>.*?)^ *```$",
     re.M | re.S,
 )
 INDENTED = re.compile(r"^    (?P<line>(?:segvisrl|make|python|pytest|pip|uv|source|git) .*)$", re.M)
 INLINE = re.compile(r"(?<!`)`(?P<line>(?:segvisrl|make|python|pytest|pip) [^`]+)`(?!`)")
 INLINE_OPTION = re.compile(r"(?<!`)`(?P<line>--[a-z][^`]*)`(?!`)")
 SHELLS = ("bash", "sh", "console")
-PLACEHOLDERS = {"ARCH": "cnn", "COMMAND": "train", "N": "4", "NAME": "cnn", "X": "20", "RUN": "runs/A", "TARGET": "help"}
+PLACEHOLDERS = {"ARCH": "cnn", "COMMAND": "train", "N": "4", "NAME": "cnn", "X": "20", "RUN": "runs/A"}
 ASSIGNMENT = re.compile(r"[A-Z_]+=")
 
 

@@ -1,4 +1,4 @@
-"""What the documentation site is given while it is built: the help of every command, and diagrams that follow the theme.
+"""What the site is given while it is built: the help of every command, and diagrams that follow the theme.
 
 MkDocs calls the functions named ``on_...``. Nothing here is copied text: the help comes from the commands themselves.
 """
