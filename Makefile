@@ -20,7 +20,7 @@ unexport JAX_PLATFORMS
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help setup sb3 train eval baselines demo sweep bench table test test-fast check format lock clean
+.PHONY: help setup sb3 train eval baselines demo sweep bench table test test-fast check format docs docs-serve lock clean
 
 help: ## this list
 	@echo "usage: make TARGET [ARCH=cnn_lstm|cnn|cnn_lstm_raw|mlp|mlp_rocks] [PRESET=auto|cpu|gpu|paper|smoke] [STEPS=] [SEED=] [RUN=] [ARGS=]"
@@ -78,9 +78,24 @@ format: $(READY) ## rewrite the code in the project's format
 	@$(BIN)/ruff format .
 	@$(BIN)/ruff check --fix .
 
+DOCS_READY := $(VENV)/.docs-ready
+
+docs: $(DOCS_READY) ## build the documentation site: site/index.html
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	@echo site/index.html
+
+docs-serve: $(DOCS_READY) ## show the documentation site on http://127.0.0.1:8000, and follow changes
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve
+
+$(DOCS_READY): requirements-docs.lock $(READY)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-docs.lock
+	@touch $@
+
 lock: $(READY) ## resolve pyproject.toml anew into requirements.lock (needs uv on the path)
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --extra dev --upgrade \
 	  --no-emit-index-url --no-emit-find-links --no-annotate --no-header pyproject.toml -o requirements.lock
+	sed -n '/^docs = \[/,/^\]/s/^ *"\(.*\)",.*/\1/p' pyproject.toml | uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --upgrade \
+	  --constraints requirements.lock --no-emit-index-url --no-emit-find-links --no-annotate --no-header - -o requirements-docs.lock
 
 clean: ## remove the environment and caches; runs stay
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist *.egg-info
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist site *.egg-info
