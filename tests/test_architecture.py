@@ -20,6 +20,7 @@ MAY_IMPORT = {  # part -> the parts it may import, besides itself
     "adapters": {"config", "types", "env", "report"},
     "export": {"config", "env", "vision", "training", "agent", "report"},
     "machine": {"config", "env", "vision", "training"},
+    "view": {"config", "types", "env", "vision", "training", "report"},
     "commands": {
         "assets",
         "config",
@@ -31,6 +32,7 @@ MAY_IMPORT = {  # part -> the parts it may import, besides itself
         "report",
         "machine",
         "export",
+        "view",
         "cli",
     },
     "cli": {"config", "commands"},
