@@ -56,6 +56,7 @@ class Session:
         self.rover = rover
         self.proposal: Float32[np.ndarray, "2"] | None = None  # what the policy last wanted
         self.command = np.zeros(2, np.float32)  # what the wheels last followed
+        self.policy_drove = True  # in the last decision
         self._carry = self.policy.initial_carry(1)
         self._is_first = jnp.ones(1, jnp.float32)
         self._seen: UInt8[np.ndarray, "H W 3"] | None = None
@@ -77,6 +78,7 @@ class Session:
         self._carry, proposal = self._decide(self._params, self._carry, self.rover, self._is_first, key)
         self._is_first = jnp.zeros(1, jnp.float32)
         self.proposal = np.clip(np.asarray(proposal), 0.0, 1.0)
+        self.policy_drove = command is None
         self.command = self.proposal if command is None else np.clip(np.asarray(command, np.float32), 0.0, 1.0)
         self.rover, qpos = self._advance(self.rover, jnp.asarray(self.command))
         self._seen = None
