@@ -3,6 +3,7 @@
 This file owns widgets and keys. What they do is handed in as ``Actions``, called in viser's threads.
 """
 
+import functools
 import html
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -79,7 +80,8 @@ class Panel:
             clock = gui.add_button_group("Time", ("Pause / go", "One decision"))
             by_label = {"Pause / go": actions.pause, "One decision": actions.step}
             clock.on_click(lambda event: by_label[event.target.value]())
-            self._speed = gui.add_dropdown("Speed", tuple(f"{speed:g} x" for speed in SPEEDS), f"{START_SPEED:g} x")
+            speeds = [f"{speed:g} x" for speed in SPEEDS]
+            self._speed = gui.add_dropdown("Speed", speeds, initial_value=f"{START_SPEED:g} x")
 
     def _add_scene(self, session: Session, things: list[str]) -> None:
         gui, actions = self._gui, self._actions
@@ -89,7 +91,7 @@ class Panel:
             again = gui.add_button_group("Again", ("Restart", "Reset"))
             by_label = {"Restart": actions.restart, "Reset": actions.reset}
             again.on_click(lambda event: by_label[event.target.value]())
-            self._moved = gui.add_dropdown("Move", (NOTHING, *things), NOTHING)
+            self._moved = gui.add_dropdown("Move", [NOTHING, *things], initial_value=NOTHING)
             self._moved.on_update(self._moved_changed)
             self._follow = gui.add_checkbox("Follow the rover", True)
             self._follow.on_update(lambda event: actions.follow(event.target.value))
@@ -120,7 +122,7 @@ class Panel:
     def _add_keys(self) -> None:
         actions = self._actions
         for direction, (key, label) in KEYS.items():
-            self._add_key(label, key, lambda direction=direction: actions.press(direction))
+            self._add_key(label, key, functools.partial(actions.press, direction))
         self._add_key("Pause or go on", "space", actions.pause)
         self._add_key("One decision", "N", actions.step)
         self._add_key("Restart: moved things stay", "R", actions.restart)
@@ -129,13 +131,13 @@ class Panel:
 
     def _add_key(self, label: str, key: str, act: Callable[[], None]) -> None:
         command = self._gui.add_command(label, hotkey=key)  # type: ignore[arg-type]
-        command.on_trigger(lambda _: act())
+        command.on_trigger(lambda event: act())
 
     def _toggle_policy(self) -> None:
-        self._policy.value = not self._policy.value
+        self._policy.value = not self._policy.value  # type: ignore[misc]
 
     def _toggle_follow(self) -> None:
-        self._follow.value = not self._follow.value
+        self._follow.value = not self._follow.value  # type: ignore[misc]
         self._actions.follow(self._follow.value)
 
     # What is set
@@ -167,7 +169,7 @@ class Panel:
 
     def show_picked(self, name: str | None) -> None:
         """What the gizmo is on."""
-        self._moved.value = name or NOTHING
+        self._moved.value = name or NOTHING  # type: ignore[misc]
 
     def show_camera(self, coloured: Image, segmented: Image) -> None:
         """The onboard camera."""

@@ -54,7 +54,7 @@ class Session:
 
     def _begin(self, rover: RoverState) -> None:
         self.rover = rover
-        self.proposal: Float32[np.ndarray, "2"] | None = None  # what the policy last wanted
+        self.proposal: np.ndarray | None = None  # (2,) float32: what the policy last wanted
         self.command = np.zeros(2, np.float32)  # what the wheels last followed
         self.policy_drove = True  # in the last decision
         self._carry = self.policy.initial_carry(1)

@@ -61,13 +61,19 @@ def _body(model: mujoco.MjModel, body: int) -> list[Solid]:
         material = model.geom_matid[geom]
         colour = _rgb(model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom])
         by_colour.setdefault(colour, []).append(_geom(model, geom))
-    joined = {colour: trimesh.util.concatenate(parts) for colour, parts in by_colour.items()}
-    return [Solid(mesh.vertices, mesh.faces, colour) for colour, mesh in joined.items()]
+    return [_joined(parts, colour) for colour, parts in by_colour.items()]
+
+
+def _joined(parts: list[trimesh.Trimesh], colour: Colour) -> Solid:
+    """Several meshes as one."""
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + start for part, start in zip(parts, first, strict=False)]
+    return Solid(np.concatenate([part.vertices for part in parts]), np.concatenate(faces), colour)
 
 
 def _geom(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
     """One primitive in its body's frame."""
-    kind, size = model.geom_type[geom], model.geom_size[geom]
+    kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
     mesh = _primitive(kind, size)
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
@@ -77,7 +83,7 @@ def _geom(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
     return mesh.apply_transform(placed)
 
 
-def _primitive(kind: int, size: Float[np.ndarray, "3"]) -> trimesh.Trimesh:
+def _primitive(kind: mujoco.mjtGeom, size: Float[np.ndarray, "3"]) -> trimesh.Trimesh:
     """MuJoCo's sizes are halves; its capsules and cylinders lie along z, as trimesh's do."""
     kinds = mujoco.mjtGeom
     radius, half = float(size[0]), float(size[1])
@@ -91,7 +97,7 @@ def _primitive(kind: int, size: Float[np.ndarray, "3"]) -> trimesh.Trimesh:
     if kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):
         ball = trimesh.creation.icosphere(subdivisions=2)
         return ball.apply_scale(radius if kind == kinds.mjGEOM_SPHERE else size)
-    raise NotImplementedError(f"the viewer draws no geom of type {mujoco.mjtGeom(kind).name}")
+    raise NotImplementedError(f"the viewer draws no geom of type {kind.name}")
 
 
 def _rgb(rgba: Float[np.ndarray, "4"]) -> Colour:

@@ -40,7 +40,7 @@ class Viewer:
         self._dragged: dict[str, tuple[float, float]] = {}
         self._motion: Motion | None = None
         self._trail: list[Float[np.ndarray, "K 2"]] = []
-        self._is_paused, self._steps_due = False, 0
+        self.is_paused, self._steps_due = False, 0
         self._panes_are_old, self._panes_due_s = True, 0.0
         with quiet_viser():
             self.server = viser.ViserServer(host, port, label="segvisrl view", verbose=False)
@@ -87,11 +87,11 @@ class Viewer:
         self._keys.press(direction, time.monotonic())
 
     def _pause(self) -> None:
-        self._is_paused = not self._is_paused
-        self.panel.show_state(self.session, self._is_paused)
+        self.is_paused = not self.is_paused
+        self.panel.show_state(self.session, self.is_paused)
 
     def _step(self) -> None:
-        self._is_paused = True
+        self.is_paused = True
         self._steps_due += 1
 
     def _follow(self, is_on: bool) -> None:
@@ -117,7 +117,7 @@ class Viewer:
         self.panel.show_picked(None)
         self.stage.show_trail(self._trail[0])
         self.stage.show_rover(self._pose)
-        self.panel.show_state(self.session, self._is_paused)
+        self.panel.show_state(self.session, self.is_paused)
         self._panes_are_old = True
 
     def _move_dragged(self) -> None:
@@ -128,8 +128,13 @@ class Viewer:
             else:
                 self.session.move_rock(int(name.split()[1]) - 1, xy_m)
             self.stage.place_things(self.session.scene)
-            self.panel.show_state(self.session, self._is_paused)
+            self.panel.show_state(self.session, self.is_paused)
             self._panes_are_old = True
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether a decision is being shown."""
+        return self._motion is not None
 
     # The loop
 
@@ -175,12 +180,12 @@ class Viewer:
             self._motion = None
             self._trail.append(motion.poses[1:, :2])
             self.stage.show_trail(np.concatenate(self._trail))
-            self.panel.show_state(self.session, self._is_paused)
+            self.panel.show_state(self.session, self.is_paused)
 
     def _may_decide(self) -> bool:
         if self.session.is_over or not self.server.get_clients():
             return False
-        return not self._is_paused or self._steps_due > 0
+        return not self.is_paused or self._steps_due > 0
 
     def _decide(self, now_s: float) -> None:
         self._steps_due = max(0, self._steps_due - 1)

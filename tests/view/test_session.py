@@ -38,6 +38,11 @@ def place(session: Session) -> np.ndarray:
     return np.asarray(session.rover.physics.qpos[:2])
 
 
+def beside(session: Session, x_m: float, y_m: float) -> tuple[float, float]:
+    x, y = place(session)
+    return float(x) + x_m, float(y) + y_m
+
+
 def test_the_policy_drives_as_in_the_demo(session, driven):
     env, policy, params = driven
     episode = drive_episode(env, policy, params, scene_stream(SCENE, TEST_STREAM))
@@ -78,7 +83,7 @@ def test_a_rock_dragged_onto_the_rover_is_a_collision(session):
     looked = session.observation
     session.decide(AHEAD)
     assert session.outcome == Outcome.RUNNING
-    session.move_rock(2, tuple(place(session) + [0.55, 0.0]))
+    session.move_rock(2, beside(session, 0.55, 0.0))
     assert session.rock_distance_m == pytest.approx(0.55, abs=1e-3)
     assert not np.array_equal(session.observation, looked)  # the camera sees it at once
     poses = session.decide(AHEAD)
@@ -90,7 +95,7 @@ def test_a_rock_dragged_onto_the_rover_is_a_collision(session):
 
 def test_the_goal_dragged_to_the_rover_is_a_success(session):
     far = session.goal_distance_m
-    session.move_goal(tuple(place(session) + [0.8, 0.3]))
+    session.move_goal(beside(session, 0.8, 0.3))
     assert session.goal_distance_m < 1 < far
     session.decide(None)
     assert session.outcome == Outcome.SUCCESS

@@ -1,0 +1,146 @@
+"""``segvisrl view``: mistakes get one line; in a real browser the page drives, listens to keys, and lets one drag."""
+
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from io import BytesIO
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from segvisrl_jax.cli import main
+from segvisrl_jax.commands import view
+
+pytest.importorskip("viser", reason='viser is not installed: pip install "segvisrl_jax[view]"')
+
+PATIENCE_S = 90  # drawing 3-D without a GPU is slow beside other work
+WINDOW_PX = (1000, 640)
+
+
+def wait_for(is_so, what: str) -> None:
+    until = time.monotonic() + PATIENCE_S
+    while not is_so():
+        assert time.monotonic() < until, what
+        time.sleep(0.05)
+
+
+@pytest.fixture(scope="module")
+def viewer():
+    """A page whose loop runs, as the command's does."""
+    opened = view.open_viewer(view.ViewOptions(scene=7, num_rocks=3, port=0))
+    stop = threading.Event()
+    loop = threading.Thread(target=opened.run, args=(stop,))
+    loop.start()
+    yield opened
+    stop.set()
+    loop.join()
+    opened.close()
+
+
+def url(viewer) -> str:
+    return f"http://127.0.0.1:{viewer.server.get_port()}"
+
+
+def test_the_page_is_served_and_nothing_drives_while_nobody_looks(viewer):
+    page = urllib.request.urlopen(url(viewer)).read()
+    assert b"<script" in page
+    assert viewer.session.time_s == 0
+
+
+@pytest.fixture(scope="module")
+def browser(viewer):
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    binary = shutil.which("chromium") or shutil.which("google-chrome")
+    driver = shutil.which("chromedriver")
+    if not (binary and driver):
+        pytest.skip("no chromium with chromedriver on the path (Debian: chromium and chromium-driver)")
+    options = webdriver.ChromeOptions()
+    options.binary_location = binary
+    size = "--window-size={},{}".format(*WINDOW_PX)
+    for word in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--enable-unsafe-swiftshader", size):
+        options.add_argument(word)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    chrome = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
+    chrome.get(url(viewer))
+    yield chrome
+    chrome.quit()
+
+
+def keys(browser, *pressed) -> None:
+    from selenium.webdriver import ActionChains
+
+    chain = ActionChains(browser)
+    for key in pressed:
+        chain.send_keys(key)
+    chain.perform()
+
+
+def camera_place(viewer) -> np.ndarray:
+    [client] = viewer.server.get_clients().values()
+    return np.array([*client.camera.position, *client.camera.look_at])
+
+
+def test_the_policy_drives_while_a_browser_looks(viewer, browser):
+    wait_for(lambda: viewer.session.time_s >= 3, "the policy drives")
+    assert viewer.session.policy_drove
+    picture = np.asarray(Image.open(BytesIO(browser.get_screenshot_as_png())).convert("RGB"))
+    colours, counts = np.unique(picture.reshape(-1, 3), axis=0, return_counts=True)
+    assert len(colours) > 500
+    assert counts.max() < 0.7 * counts.sum()
+    severe = [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+    assert severe == []
+
+
+def test_keys_pause_drive_and_leave_the_camera_alone(viewer, browser):
+    from selenium.webdriver.common.keys import Keys
+
+    keys(browser, " ")
+    wait_for(lambda: viewer.is_paused and not viewer.is_moving, "the space key pauses")
+    keys(browser, "r")
+    wait_for(lambda: viewer.session.time_s == 0, "R restarts")
+    camera = camera_place(viewer)
+    keys(browser, Keys.ARROW_LEFT, "n")
+    wait_for(lambda: viewer.session.time_s == 1, "N makes one decision")
+    assert not viewer.session.policy_drove
+    assert np.allclose(viewer.session.command, [0.2, 1.0])
+    time.sleep(1)
+    np.testing.assert_allclose(camera_place(viewer), camera, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--port", "99999"], ["--port", "99999", "65535"]),
+        (["--scene", "-1"], ["--scene", "-1"]),
+        (["--host", "192.0.2.1"], ["--host", "192.0.2.1"]),
+        (["--host", "no.such.host.invalid"], ["--host", "no.such.host.invalid"]),
+        (["--policy", "nowhere"], ["nowhere", "policy.json"]),
+        (["--policy", "cnn", "--run", "runs/x"], ["--run, --policy", "exactly one"]),
+    ],
+)
+def test_mistakes_get_one_line(words, says, capsys):
+    assert main(["view", *words]) == 2
+    [line] = capsys.readouterr().err.strip().splitlines()
+    for part in says:
+        assert part in line
+
+
+def test_a_port_in_use_gets_one_line(capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main(["view", "--port", str(port)]) == 2
+    [line] = capsys.readouterr().err.strip().splitlines()
+    assert f"127.0.0.1:{port}" in line
+    assert "in use" in line
+
+
+def test_without_viser_there_is_one_line(capsys, monkeypatch):
+    monkeypatch.setattr(view, "find_spec", lambda name: None)
+    assert main(["view"]) == 2
+    [line] = capsys.readouterr().err.strip().splitlines()
+    assert 'pip install "segvisrl_jax[view]"' in line
