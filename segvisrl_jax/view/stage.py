@@ -43,13 +43,18 @@ class Stage:
         self._data = mujoco.MjData(env.mj_model)
         self._world = server.scene.add_frame(WORLD, show_axes=False)
         self._things: dict[str, viser.FrameHandle] = {}
-        self._picked: str | None = None
+        self.picked: str | None = None  # what the gizmo is on
         self._gizmo: viser.TransformControlsHandle | None = None
         self._trail: viser.LineSegmentsHandle | None = None
         self._bodies = self._add_rover()
         self._add_ground()
         self._light()
         self.follow = True
+
+    @property
+    def offset_m(self) -> Float[np.ndarray, "3"]:
+        """What is added to a place in the world, so that the rover stays in the middle."""
+        return self._world.position
 
     # What does not change within a scene
 
@@ -154,7 +159,7 @@ class Stage:
         if self._gizmo is not None:
             self._gizmo.remove()
             self._gizmo = None
-        self._picked = name
+        self.picked = name
         if name is None:
             return
         gizmo = self._server.scene.add_transform_controls(

@@ -2,8 +2,6 @@
 
 import shutil
 import socket
-import subprocess
-import sys
 import threading
 import time
 import urllib.request
@@ -12,6 +10,7 @@ from io import BytesIO
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from segvisrl_jax.cli import main
 from segvisrl_jax.commands import view
@@ -71,13 +70,49 @@ def browser(viewer):
     chrome.quit()
 
 
-def keys(browser, *pressed) -> None:
+def keys(browser, *pressed: str, held_s: float = 0.0) -> None:
     from selenium.webdriver import ActionChains
 
     chain = ActionChains(browser)
     for key in pressed:
-        chain.send_keys(key)
+        chain.key_down(key).pause(held_s).key_up(key)
     chain.perform()
+
+
+CANVAS = """
+const box = [...document.querySelectorAll('canvas')].map(one => one.getBoundingClientRect())
+  .reduce((most, one) => one.width * one.height > most.width * most.height ? one : most);
+return [box.left, box.top, box.width, box.height];
+"""
+
+
+def on_page(viewer, browser, xyz_m) -> np.ndarray:
+    """Where a point of the scene is on the page, in CSS pixels (x, y)."""
+    [client] = viewer.server.get_clients().values()
+    left, top, width, height = browser.execute_script(CANVAS)
+    place = np.array(xyz_m) + viewer.stage.offset_m - client.camera.position
+    w, x, y, z = client.camera.wxyz  # x to the right, y down, z ahead
+    right, down, ahead = Rotation.from_quat([x, y, z, w]).as_matrix().T @ place
+    focal_px = height / 2 / np.tan(client.camera.fov / 2)
+    return np.array([left + width / 2 + focal_px * right / ahead, top + height / 2 + focal_px * down / ahead])
+
+
+def mouse(browser, *places) -> None:
+    """Presses at the first place, goes over the others, lets go at the last."""
+    from selenium.webdriver import ActionChains
+    from selenium.webdriver.common.actions.action_builder import ActionBuilder
+
+    builder = ActionBuilder(browser, duration=100)
+    pointer = builder.pointer_action
+    for number, (x, y) in enumerate(places):
+        pointer.move_to_location(round(x), round(y))
+        pointer.pause(0.5)
+        if number == 0:
+            pointer.pointer_down()
+            pointer.pause(0.3)
+    pointer.pointer_up()
+    builder.perform()
+    ActionChains(browser).reset_actions()
 
 
 def camera_place(viewer) -> np.ndarray:
@@ -104,12 +139,37 @@ def test_keys_pause_drive_and_leave_the_camera_alone(viewer, browser):
     keys(browser, "r")
     wait_for(lambda: viewer.session.time_s == 0, "R restarts")
     camera = camera_place(viewer)
-    keys(browser, Keys.ARROW_LEFT, "n")
+    keys(browser, Keys.ARROW_LEFT, held_s=0.5)
+    keys(browser, "n")
     wait_for(lambda: viewer.session.time_s == 1, "N makes one decision")
     assert not viewer.session.policy_drove
     assert np.allclose(viewer.session.command, [0.2, 1.0])
     time.sleep(1)
     np.testing.assert_allclose(camera_place(viewer), camera, atol=0.01)
+
+
+def test_a_rock_is_clicked_dragged_and_hit(viewer, browser):
+    assert viewer.is_paused
+    keys(browser, "r")
+    wait_for(lambda: viewer.session.time_s == 0 and not viewer.is_moving, "R restarts")
+    x, y = np.asarray(viewer.session.rover.physics.qpos[:2])
+    viewer.session.move_rock(1, (x + 2.0, y + 0.4))
+    viewer.stage.place_things(viewer.session.scene)
+    time.sleep(2)
+    mouse(browser, on_page(viewer, browser, (x + 2.0, y + 0.4, 0.1)))
+    wait_for(lambda: viewer.stage.picked == "rock 2", "a click picks the rock")
+    time.sleep(2)
+    handle = on_page(viewer, browser, (x + 2.7, y + 0.4, 0.0))
+    browser.save_screenshot("/tmp/drag0.png")
+    mouse(
+        browser,
+        handle,
+        on_page(viewer, browser, (x + 2.0, y + 0.4, 0.0)),
+        on_page(viewer, browser, (x + 1.0, y + 0.4, 0.0)),
+    )
+    browser.save_screenshot("/tmp/drag1.png")
+    print(viewer.session.scene.rock_xy_m - np.array([x, y]))
+    assert viewer.session.rock_distance_m < 1.2
 
 
 @pytest.mark.parametrize(
