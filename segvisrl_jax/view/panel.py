@@ -186,12 +186,13 @@ def state_table(session: Session, is_paused: bool) -> str:
     """The episode in numbers, as a markdown table."""
     left, right = session.wheel_speeds_rad_s.reshape(2, 2).mean(axis=0)
     outcome = OUTCOME_NAMES[session.outcome] if session.is_over or not is_paused else "paused"
+    nearest_m = session.rock_distance_m
     rows = {
         "outcome": f"**{outcome}**",
         "driven by": html.escape(session.policy.name) if session.policy_drove else "you",
         "time": f"{session.time_s:.0f} s",
         "to the goal": f"{session.goal_distance_m:.2f} m",
-        "nearest rock": f"{session.rock_distance_m:.2f} m",
+        "nearest rock": f"{nearest_m:.2f} m" if np.isfinite(nearest_m) else "none",
         "wheels, left / right": f"{left:.2f} / {right:.2f} rad/s",
         "commanded": _shares(session.command),
         "the policy wants": "" if session.proposal is None else _shares(session.proposal),

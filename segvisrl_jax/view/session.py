@@ -15,7 +15,7 @@ from segvisrl_jax.env.conditions import wheel_shares
 from segvisrl_jax.env.rover_env import RoverEnv
 from segvisrl_jax.env.wrappers import TEST_STREAM, scene_stream
 from segvisrl_jax.training.policy import Policy
-from segvisrl_jax.types import Outcome, RoverState, Scene
+from segvisrl_jax.types import Observation, Outcome, RoverState, Scene
 
 WHEEL_SPEEDS = slice(6, 10)  # in qvel, behind the free joint's
 
@@ -59,7 +59,7 @@ class Session:
         self.policy_drove = True  # in the last decision
         self._carry = self.policy.initial_carry(1)
         self._is_first = jnp.ones(1, jnp.float32)
-        self._seen: UInt8[np.ndarray, "H W 3"] | None = None
+        self._seen: Observation | None = None
 
     # Driving
 
@@ -75,7 +75,8 @@ class Session:
         if self.is_over:
             return np.zeros((0, 11), np.float32)
         key = jax.random.fold_in(self._key, self.rover.num_decisions + 1)
-        self._carry, proposal = self._decide(self._params, self._carry, self.rover, self._is_first, key)
+        seen = self._look() if self.policy.observes else None
+        self._carry, proposal = self._decide(self._params, self._carry, self.rover, seen, self._is_first, key)
         self._is_first = jnp.zeros(1, jnp.float32)
         self.proposal = np.clip(np.asarray(proposal), 0.0, 1.0)
         self.policy_drove = command is None
@@ -85,12 +86,17 @@ class Session:
         return _until(np.asarray(qpos), np.asarray(self.rover.physics.qpos))
 
     def _ask(
-        self, params: Any, carry: Any, rover: RoverState, is_first: Array, key: PRNGKeyArray
+        self,
+        params: Any,
+        carry: Any,
+        rover: RoverState,
+        seen: Observation | None,
+        is_first: Float32[Array, "1"],
+        key: PRNGKeyArray,
     ) -> tuple[Any, Float32[Array, "2"]]:
         """The policy's memory and action, for a batch of this one rover."""
-        batch = jax.tree.map(lambda leaf: leaf[None], rover)
-        seen = self.env.observe(rover)[None] if self.policy.observes else None
-        carry, action = self.policy.act(params, carry, batch, seen, is_first, key)
+        batch, seen_batch = jax.tree.map(lambda leaf: leaf[None], (rover, seen))
+        carry, action = self.policy.act(params, carry, batch, seen_batch, is_first, key)
         return carry, action[0]
 
     def _drive(self, rover: RoverState, action: Array) -> tuple[RoverState, Float32[Array, "J 11"]]:
@@ -167,10 +173,12 @@ class Session:
     @property
     def observation(self) -> UInt8[np.ndarray, "H W 3"] | None:
         """The policy's image of where the rover is now; None for a policy without images."""
-        if len(self.env.observation_shape) != 3:
-            return None
+        return np.asarray(self._look()) if len(self.env.observation_shape) == 3 else None
+
+    def _look(self) -> Observation:
+        """What the policy sees where the rover is now; drawn once."""
         if self._seen is None:
-            self._seen = np.asarray(self._observe(self.rover))
+            self._seen = self._observe(self.rover)
         return self._seen
 
 

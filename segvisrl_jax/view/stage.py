@@ -25,7 +25,7 @@ GOAL_COLOUR: Colour = (60, 200, 120)
 TRAIL_COLOUR: Colour = (90, 180, 255)
 LINE_HEIGHT_M = 0.01  # above the ground, so that it does not flicker through it
 RING_SIDES = 48
-AMBIENT_INTENSITY, SUN_INTENSITY = 0.35, 1.6
+AMBIENT_INTENSITY, SUN_INTENSITY = 1.2, 6.0
 SUN_DISTANCE_M = 100.0  # viser's sun shines from its place towards the origin
 MOVE = Callable[[str, tuple[float, float]], None]
 
@@ -118,6 +118,7 @@ class Stage:
         x, y, z = (SUN_DISTANCE_M * float(part) for part in sun_direction(self._env.config.scene))
         scene = self._server.scene
         scene.configure_default_lights(enabled=False)
+        scene.configure_environment_map(None)
         scene.add_light_ambient("/ambient", intensity=AMBIENT_INTENSITY)
         scene.add_light_directional("/sun", intensity=SUN_INTENSITY, cast_shadow=True, position=(x, y, z))
 

@@ -39,6 +39,7 @@ class Viewer:
         self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._dragged: dict[str, tuple[float, float]] = {}
         self._motion: Motion | None = None
+        self._last_ended_s = -np.inf  # the motion before
         self._trail: list[Float[np.ndarray, "K 2"]] = []
         self.is_paused, self._steps_due = False, 0
         self._panes_are_old, self._panes_due_s = True, 0.0
@@ -155,7 +156,11 @@ class Viewer:
         """Draws and decides once, so that nothing stutters later."""
         self._show_panes()
         self.session.decide(None)
-        self.session.move_goal(tuple(np.asarray(self.session.scene.goal_xy_m)))
+        scene = self.session.scene
+        self.session.move_goal(tuple(scene.goal_xy_m))
+        if len(scene.rock_xy_m):
+            self.session.move_rock(0, tuple(scene.rock_xy_m[0]))
+        self._again(self.session.restart)
         self._again(self.session.reset)
 
     def tick(self, now_s: float) -> None:
@@ -177,7 +182,7 @@ class Viewer:
         self.stage.show_rover(self._pose)
         self._panes_are_old = True
         if now_s >= motion.ends_s:
-            self._motion = None
+            self._motion, self._last_ended_s = None, motion.ends_s
             self._trail.append(motion.poses[1:, :2])
             self.stage.show_trail(np.concatenate(self._trail))
             self.panel.show_state(self.session, self.is_paused)
@@ -194,7 +199,8 @@ class Viewer:
             command = self.panel.wheels
         poses = self.session.decide(command)
         instant_s = self.session.env.config.task.judge_dt_s / self.panel.speed
-        self._motion = Motion(np.concatenate([self._pose[None], poses]), now_s, instant_s)
+        began_s = max(self._last_ended_s, now_s - FRAME_S)  # right behind the one before: no time is lost
+        self._motion = Motion(np.concatenate([self._pose[None], poses]), began_s, instant_s)
 
     def _show_panes(self) -> None:
         """The camera panes for the pose that is shown; what the policy sees where a decision ended."""

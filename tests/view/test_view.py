@@ -66,6 +66,7 @@ def browser(viewer):
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     chrome = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
     chrome.get(url(viewer))
+    wait_for(lambda: viewer.session.time_s >= 1, "the browser looks")
     yield chrome
     chrome.quit()
 
