@@ -13,15 +13,17 @@ import time
 from io import BytesIO
 from pathlib import Path
 
+import numpy as np
 from PIL import Image
 from selenium import webdriver
 
 from segvisrl_jax.commands.view import ViewOptions, open_viewer
+from segvisrl_jax.view.stage import rock_name
 
 IS_SCRIPT = "__file__" in globals()
 OUTPUT = Path(sys.argv[1]) if IS_SCRIPT and len(sys.argv) > 1 else Path("docs/images")
 OUTPUT.mkdir(parents=True, exist_ok=True)
-SCENE, NUM_ROCKS, DRIVEN_S, PICKED = 7, 24, 30, "rock 4"
+SCENE, NUM_ROCKS, DRIVEN_S = 5, 24, 34
 WINDOW_PX = (1480, 1000)
 SETTLING_S = 8  # for the last images to arrive, and for a processor to draw what a graphics card draws at once
 CLOSE_NOTE = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(one => one.click())"
@@ -44,8 +46,10 @@ while viewer.session.time_s < DRIVEN_S and not viewer.session.is_over:
     time.sleep(0.05)
 stop.set()
 loop.join()
-viewer.stage.pick(PICKED)
-viewer.panel.show_picked(PICKED)
+rover, scene = viewer.session.rover.physics.qpos, viewer.session.scene
+picked = rock_name(int(np.argmin(np.linalg.norm(np.asarray(scene.rock_xy_m - rover[:2]), axis=1))))
+viewer.stage.pick(picked)
+viewer.panel.show_picked(picked)
 browser.execute_script(CLOSE_NOTE)
 time.sleep(SETTLING_S)
 picture = Image.open(BytesIO(browser.get_screenshot_as_png())).convert("RGB")

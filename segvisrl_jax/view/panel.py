@@ -115,7 +115,7 @@ class Panel:
             self._segmented = self._gui.add_image(blank, label="segmentation", format="png")
             is_image = len(env.observation_shape) == 3
             caption = observation_caption(env) if is_image else ""
-            self._seen = self._gui.add_image(blank, label=caption, format="png", visible=is_image)
+            self.seen = self._gui.add_image(blank, label=caption, format="png", visible=is_image)
         panel.dock_left()
         panel.set_width(PANES_WIDTH_PX)
 
@@ -179,7 +179,7 @@ class Panel:
     def show_seen(self, observation: Image | None) -> None:
         """What the policy sees; None for a policy without images."""
         if observation is not None:
-            self._seen.image = enlarged(observation)
+            self.seen.image = enlarged(observation)
 
 
 def state_table(session: Session, is_paused: bool) -> str:

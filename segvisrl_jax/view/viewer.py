@@ -47,7 +47,7 @@ class Viewer:
             self.server = viser.ViserServer(host, port, label="segvisrl view", verbose=False)
         self._dress_page()
         things = [GOAL, *(rock_name(index) for index in range(len(session.scene.rock_xy_m)))]
-        self.stage = Stage(self.server, session.env, self._ask_pick, self._drag)
+        self.stage = Stage(self.server, session.env, self._ask_pick, self.drag)
         self.panel = Panel(self.server, session, things, self._actions())
         self._begin()
         self.panel.show_note(GETTING_READY)
@@ -79,7 +79,8 @@ class Viewer:
     def _ask_pick(self, name: str | None) -> None:
         self._asked.put(lambda: self._pick(name))
 
-    def _drag(self, name: str, xy_m: tuple[float, float]) -> None:
+    def drag(self, name: str, xy_m: tuple[float, float]) -> None:
+        """``goal`` or ``rock 1`` ... shall stand there from the next frame on. From any thread."""
         self._dragged[name] = xy_m  # only the last place counts
 
     # ... and done, in the loop's
@@ -197,13 +198,14 @@ class Viewer:
         command = self._keys.command(now_s)
         if command is None and not self.panel.policy_drives:
             command = self.panel.wheels
+        self.panel.show_seen(self.session.observation)  # on which the policy decides
         poses = self.session.decide(command)
         instant_s = self.session.env.config.task.judge_dt_s / self.panel.speed
         began_s = max(self._last_ended_s, now_s - FRAME_S)  # right behind the one before: no time is lost
         self._motion = Motion(np.concatenate([self._pose[None], poses]), began_s, instant_s)
 
     def _show_panes(self) -> None:
-        """The camera panes for the pose that is shown; what the policy sees where a decision ended."""
+        """The camera panes for the pose that is shown; where nothing moves, what the policy sees too."""
         self._panes_are_old = False
         rover = at_pose(self.session.rover, self._pose)
         self.panel.show_camera(self._panes.coloured(rover), self._panes.segmented(rover))

@@ -1,7 +1,10 @@
 """``segvisrl view``: mistakes get one line; in a real browser the page drives, listens to keys, and lets one drag."""
 
 import shutil
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 import urllib.request
@@ -14,11 +17,15 @@ from scipy.spatial.transform import Rotation
 
 from segvisrl_jax.cli import main
 from segvisrl_jax.commands import view
+from segvisrl_jax.types import Outcome
 
 pytest.importorskip("viser", reason='viser is not installed: pip install "segvisrl_jax[view]"')
 
+from segvisrl_jax.view.panel import state_table
+
 PATIENCE_S = 90  # drawing 3-D without a GPU is slow beside other work
 WINDOW_PX = (1000, 640)
+SETTLING_S = 1.5  # until a browser shows what it was sent
 
 
 def wait_for(is_so, what: str) -> None:
@@ -122,8 +129,10 @@ def camera_place(viewer) -> np.ndarray:
 
 
 def test_the_policy_drives_while_a_browser_looks(viewer, browser):
-    wait_for(lambda: viewer.session.time_s >= 3, "the policy drives")
+    seen, began_s = viewer.panel.seen.image, viewer.session.time_s
+    wait_for(lambda: viewer.session.time_s >= began_s + 4, "the policy drives")
     assert viewer.session.policy_drove
+    assert not np.array_equal(viewer.panel.seen.image, seen)
     picture = np.asarray(Image.open(BytesIO(browser.get_screenshot_as_png())).convert("RGB"))
     colours, counts = np.unique(picture.reshape(-1, 3), axis=0, return_counts=True)
     assert len(colours) > 500
@@ -145,32 +154,42 @@ def test_keys_pause_drive_and_leave_the_camera_alone(viewer, browser):
     wait_for(lambda: viewer.session.time_s == 1, "N makes one decision")
     assert not viewer.session.policy_drove
     assert np.allclose(viewer.session.command, [0.2, 1.0])
-    time.sleep(1)
+    time.sleep(SETTLING_S)
     np.testing.assert_allclose(camera_place(viewer), camera, atol=0.01)
 
 
 def test_a_rock_is_clicked_dragged_and_hit(viewer, browser):
-    assert viewer.is_paused
     keys(browser, "r")
     wait_for(lambda: viewer.session.time_s == 0 and not viewer.is_moving, "R restarts")
     x, y = np.asarray(viewer.session.rover.physics.qpos[:2])
-    viewer.session.move_rock(1, (x + 2.0, y + 0.4))
-    viewer.stage.place_things(viewer.session.scene)
-    time.sleep(2)
-    mouse(browser, on_page(viewer, browser, (x + 2.0, y + 0.4, 0.1)))
+    place = (x + 2.0, y + 0.4)
+    viewer.drag("rock 2", place)
+    wait_for(lambda: np.allclose(viewer.session.scene.rock_xy_m[1], place), "the rock is moved")
+    time.sleep(SETTLING_S)
+    mouse(browser, on_page(viewer, browser, (*place, 0.1)))
     wait_for(lambda: viewer.stage.picked == "rock 2", "a click picks the rock")
-    time.sleep(2)
-    handle = on_page(viewer, browser, (x + 2.7, y + 0.4, 0.0))
-    browser.save_screenshot("/tmp/drag0.png")
-    mouse(
-        browser,
-        handle,
-        on_page(viewer, browser, (x + 2.0, y + 0.4, 0.0)),
-        on_page(viewer, browser, (x + 1.0, y + 0.4, 0.0)),
-    )
-    browser.save_screenshot("/tmp/drag1.png")
-    print(viewer.session.scene.rock_xy_m - np.array([x, y]))
-    assert viewer.session.rock_distance_m < 1.2
+    time.sleep(SETTLING_S)
+    along_x = [on_page(viewer, browser, (x + ahead, y + 0.4, 0.0)) for ahead in (2.7, 2.0, 1.0)]
+    mouse(browser, *along_x)  # the gizmo's arrow along x, by 1.7 m
+    wait_for(lambda: viewer.session.rock_distance_m < 0.8, "the rock is dragged to the rover")
+    keys(browser, "n")
+    wait_for(lambda: viewer.session.is_over, "the next decision ends the episode")
+    assert viewer.session.outcome == Outcome.COLLISION
+    assert "collision" in state_table(viewer.session, viewer.is_paused)
+
+
+def test_widgets_change_who_drives_and_the_scene(viewer, browser):
+    keys(browser, "p")
+    wait_for(lambda: not viewer.panel.policy_drives, "P takes the policy off")
+    boxes = browser.find_elements("css selector", "input")
+    [number] = [box for box in boxes if box.get_attribute("value") == "7"]
+    number.send_keys("\b8\n")
+    wait_for(lambda: viewer.session.number == 8 and not viewer.session.is_over, "another scene")
+    browser.find_element("tag name", "canvas").click()
+    keys(browser, "n")
+    wait_for(lambda: viewer.session.time_s == 1, "N makes one decision")
+    assert not viewer.session.policy_drove
+    assert np.array_equal(viewer.session.command, [0, 0])  # the sliders
 
 
 @pytest.mark.parametrize(
@@ -198,6 +217,18 @@ def test_a_port_in_use_gets_one_line(capsys):
     [line] = capsys.readouterr().err.strip().splitlines()
     assert f"127.0.0.1:{port}" in line
     assert "in use" in line
+
+
+def test_ctrl_c_ends_it_quietly():
+    """One line, with the address, and exit code 0."""
+    command = [sys.executable, "-m", "segvisrl_jax.cli", "view", "--policy", "mlp", "--port", "0"]
+    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    line = program.stdout.readline()
+    assert line.startswith("http://127.0.0.1:"), line
+    program.send_signal(signal.SIGINT)
+    rest, errors = program.communicate(timeout=PATIENCE_S)
+    assert (rest.strip(), errors) == ("", "")
+    assert program.returncode == 0
 
 
 def test_without_viser_there_is_one_line(capsys, monkeypatch):
