@@ -162,16 +162,16 @@ def test_a_rock_is_clicked_dragged_and_hit(viewer, browser):
     keys(browser, "r")
     wait_for(lambda: viewer.session.time_s == 0 and not viewer.is_moving, "R restarts")
     x, y = np.asarray(viewer.session.rover.physics.qpos[:2])
-    place = (x + 2.0, y + 0.4)
+    place = (x + 2.0, y + 0.2)
     viewer.drag("rock 2", place)
     wait_for(lambda: np.allclose(viewer.session.scene.rock_xy_m[1], place), "the rock is moved")
     time.sleep(SETTLING_S)
     mouse(browser, on_page(viewer, browser, (*place, 0.1)))
     wait_for(lambda: viewer.stage.picked == "rock 2", "a click picks the rock")
     time.sleep(SETTLING_S)
-    along_x = [on_page(viewer, browser, (x + ahead, y + 0.4, 0.0)) for ahead in (2.7, 2.0, 1.0)]
+    along_x = [on_page(viewer, browser, (x + ahead, y + 0.2, 0.0)) for ahead in (2.7, 2.0, 1.0)]
     mouse(browser, *along_x)  # the gizmo's arrow along x, by 1.7 m
-    wait_for(lambda: viewer.session.rock_distance_m < 0.8, "the rock is dragged to the rover")
+    wait_for(lambda: viewer.session.rock_distance_m < 0.5, "the rock is dragged to the rover")
     keys(browser, "n")
     wait_for(lambda: viewer.session.is_over, "the next decision ends the episode")
     assert viewer.session.outcome == Outcome.COLLISION
@@ -185,7 +185,8 @@ def test_widgets_change_who_drives_and_the_scene(viewer, browser):
     [number] = [box for box in boxes if box.get_attribute("value") == "7"]
     number.send_keys("\b8\n")
     wait_for(lambda: viewer.session.number == 8 and not viewer.session.is_over, "another scene")
-    browser.find_element("tag name", "canvas").click()
+    left, top, width, height = browser.execute_script(CANVAS)
+    mouse(browser, (left + width / 2, top + 0.9 * height))  # keys go to the 3-D view again
     keys(browser, "n")
     wait_for(lambda: viewer.session.time_s == 1, "N makes one decision")
     assert not viewer.session.policy_drove
