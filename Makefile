@@ -11,16 +11,18 @@ RUN ?=
 ARGS ?=
 EPISODES ?= 1000
 WORKERS ?= 2
+NOTEBOOKS ?= quickstart bearings curves downsampling failures learning_curves trajectories
 
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+EXTRAS_READY := $(VENV)/.extras-ready
 export JAX_PLATFORMS ?=
 ifeq ($(JAX_PLATFORMS),)
 unexport JAX_PLATFORMS
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help setup sb3 train eval baselines demo sweep bench table test test-fast check format docs docs-serve lock clean
+.PHONY: help setup extras sb3 train eval baselines demo sweep bench table test test-fast check format docs docs-serve notebooks lock clean
 
 help: ## this list
 	@echo "usage: make TARGET [ARCH=cnn_lstm|cnn|cnn_lstm_raw|mlp|mlp_rocks] [PRESET=auto|cpu|gpu|paper|smoke] [STEPS=] [SEED=] [RUN=] [ARGS=]"
@@ -35,6 +37,13 @@ $(READY): requirements.lock pyproject.toml
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+extras: $(EXTRAS_READY) ## add what view, sweeps on Ray, notebooks and docs need to .venv (0.5 GB); their tests run from then on
+
+$(EXTRAS_READY): requirements-extras.lock $(READY)
+	@echo "Adding the extras to $(VENV) from requirements-extras.lock (once)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-extras.lock
 	@touch $@
 
 sb3: $(READY) ## add Stable-Baselines3 and PyTorch (for a CPU: 0.9 GB) to .venv; its tests run from then on
@@ -78,24 +87,24 @@ format: $(READY) ## rewrite the code in the project's format
 	@$(BIN)/ruff format .
 	@$(BIN)/ruff check --fix .
 
-DOCS_READY := $(VENV)/.docs-ready
-
-docs: $(DOCS_READY) ## build the documentation site: site/index.html
+docs: $(EXTRAS_READY) ## build the documentation site: site/index.html
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 	@echo site/index.html
 
-docs-serve: $(DOCS_READY) ## show the documentation site on http://127.0.0.1:8000, and follow changes
+docs-serve: $(EXTRAS_READY) ## show the documentation site on http://127.0.0.1:8000, and follow changes
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve
 
-$(DOCS_READY): requirements-docs.lock $(READY)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-docs.lock
-	@touch $@
+notebooks: $(EXTRAS_READY) ## run NOTEBOOKS of experiments/ and write them with their outputs: notebooks/*.ipynb
+	@mkdir -p notebooks
+	@for name in $(NOTEBOOKS); do \
+	  $(BIN)/jupytext --quiet --to ipynb --execute --run-path . --output notebooks/$$name.ipynb experiments/$$name.py && \
+	  echo notebooks/$$name.ipynb || exit 1; done
 
-lock: $(READY) ## resolve pyproject.toml anew into requirements.lock (needs uv on the path)
-	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --extra dev --upgrade \
-	  --no-emit-index-url --no-emit-find-links --no-annotate --no-header pyproject.toml -o requirements.lock
-	sed -n '/^docs = \[/,/^\]/s/^ *"\(.*\)",.*/\1/p' pyproject.toml | uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --upgrade \
-	  --constraints requirements.lock --no-emit-index-url --no-emit-find-links --no-annotate --no-header - -o requirements-docs.lock
+RESOLVE := uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate --no-header
+
+lock: $(READY) ## resolve pyproject.toml anew into the two locks (needs uv on the path)
+	$(RESOLVE) --upgrade --extra dev --extra view --extra ray --extra notebooks --extra docs pyproject.toml -o requirements-extras.lock
+	$(RESOLVE) --extra dev --constraints requirements-extras.lock pyproject.toml -o requirements.lock
 
 clean: ## remove the environment and caches; runs stay
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist site *.egg-info
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist site notebooks *.egg-info

@@ -21,6 +21,7 @@ COMMANDS = {
     "table": "compare evaluations on the same scenes: the results table, in markdown",
     "report": "one self-contained HTML page about one or several runs",
     "demo": "let a policy drive one scene and write a video",
+    "view": "drive, watch and rearrange a scene in the browser",
     "export": "write a policy as a file that other programs can run: ONNX or StableHLO",
     "sweep": "train over the values of any settings, here or on a Ray cluster; a table and a plot",
     "bench": "measure physics, rendering and learning on this machine",

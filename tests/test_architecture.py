@@ -21,6 +21,7 @@ MAY_IMPORT = {  # part -> the parts it may import, besides itself
     "export": {"config", "env", "vision", "training", "agent", "report"},
     "sweep": {"config", "training"},
     "machine": {"config", "env", "vision", "training"},
+    "view": {"config", "types", "env", "vision", "training", "report"},
     "commands": {
         "assets",
         "config",
@@ -33,6 +34,7 @@ MAY_IMPORT = {  # part -> the parts it may import, besides itself
         "machine",
         "export",
         "sweep",
+        "view",
         "cli",
     },
     "cli": {"config", "commands"},

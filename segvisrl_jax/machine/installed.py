@@ -21,6 +21,7 @@ OPTIONAL = {  # package -> the extra that brings it
     "stable-baselines3": "sb3",
     "torch": "sb3",
     "onnxruntime": "onnx",
+    "viser": "view",
     "wandb": "wandb",
     "mlflow-skinny": "mlflow",
 }

@@ -1,0 +1,1 @@
+"""A browser page in which a person watches, steers and rearranges an episode."""
