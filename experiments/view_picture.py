@@ -46,14 +46,14 @@ while viewer.session.time_s < DRIVEN_S and not viewer.session.is_over:
     time.sleep(0.05)
 stop.set()
 loop.join()
-rover, scene = viewer.session.rover.physics.qpos, viewer.session.scene
-picked = rock_name(int(np.argmin(np.linalg.norm(np.asarray(scene.rock_xy_m - rover[:2]), axis=1))))
+scene = viewer.session.scene
+picked = rock_name(int(np.argmin(np.linalg.norm(np.asarray(scene.rock_xy_m - scene.goal_xy_m), axis=1))))
 viewer.stage.pick(picked)
 viewer.panel.show_picked(picked)
 browser.execute_script(CLOSE_NOTE)
 time.sleep(SETTLING_S)
 picture = Image.open(BytesIO(browser.get_screenshot_as_png())).convert("RGB")
-picture.quantize(256, dither=Image.Dither.NONE).save(OUTPUT / "view.png", optimize=True)
+picture.save(OUTPUT / "view.png", optimize=True)
 browser.quit()
 viewer.close()
 print(OUTPUT / "view.png")

@@ -43,6 +43,7 @@ def beside(session: Session, x_m: float, y_m: float) -> tuple[float, float]:
     return float(x) + x_m, float(y) + y_m
 
 
+@pytest.mark.slow
 def test_the_policy_drives_as_in_the_demo(session, driven):
     env, policy, params = driven
     episode = drive_episode(env, policy, params, scene_stream(SCENE, TEST_STREAM))
