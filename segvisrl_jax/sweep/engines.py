@@ -24,6 +24,7 @@ from segvisrl_jax.sweep.plan import Trial
 
 MARKER = ".sweep"  # holds a random word: who can read it sees the same disk
 STOP_SECONDS = 60  # what a run that is told to stop has to write its checkpoint
+CONNECT_SECONDS = 5
 GPU_SHARE = 0.9  # of a GPU's memory, for all the runs on it together
 
 
@@ -102,12 +103,20 @@ def _connect(address: str) -> Any:
     except ImportError:
         raise ConfigError('--engine ray needs Ray: pip install "segvisrl_jax[ray]"') from None
     try:
+        _require_listener(address)
         ray.init(address=address, log_to_driver=False, logging_level="ERROR")
-    except (ConnectionError, ValueError, RuntimeError, TimeoutError):
+    except (OSError, ValueError, RuntimeError):
         raise ConfigError(
             f"--ray-address = {address!r}: should be a Ray cluster that answers (start one with: ray start --head)"
         ) from None
     return ray
+
+
+def _require_listener(address: str) -> None:
+    """Connects once where an address names host and port: Ray itself tries for five minutes before it gives up."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if colon:
+        socket.create_connection((host, int(port)), CONNECT_SECONDS).close()
 
 
 def _receive(ray: Any, reference: Any, output: Path) -> Ended:

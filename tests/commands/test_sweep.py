@@ -85,15 +85,11 @@ def cluster():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_worker_niceness", "0")  # 15 by default: starved by the tests beside them
-        yield from run_cluster(Cluster)
-
-
-def run_cluster(Cluster):
-    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
-    for _ in range(2):
-        made.add_node(num_cpus=1)
-    yield made
-    made.shutdown()
+        made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+        for _ in range(2):
+            made.add_node(num_cpus=1)
+        yield made
+        made.shutdown()
 
 
 @pytest.mark.slow
@@ -133,6 +129,8 @@ def test_a_node_with_another_disk_sends_its_run_back(tmp_path, cluster):
 def test_no_cluster_is_said_in_one_line(tmp_path, monkeypatch, capsys):
     pytest.importorskip("ray")
     monkeypatch.chdir(tmp_path)
-    words = ["sweep", *SMALL, "--vary", "seed=0", "--engine", "ray", "--ray-address", "127.0.0.1:1"]
-    assert main(words) == 2
-    assert "a Ray cluster that answers" in capsys.readouterr().err
+    for address in ("127.0.0.1:1", "auto", "nobody"):
+        words = ["sweep", *SMALL, "--vary", "seed=0", "--engine", "ray", "--ray-address", address]
+        assert main(words) == 2
+        shown = capsys.readouterr().err
+        assert f"--ray-address = {address!r}: should be a Ray cluster that answers" in shown
