@@ -1,11 +1,13 @@
 """The physics in MuJoCo's C library, on a pool of threads that lives as long as the engine.
 
-One callback a decision moves the whole batch, however many ``vmap``s led to it. Works on any JAX
-backend that has JAX's cpu platform beside it; it is fast where the program itself runs on the CPU.
+One call a decision moves the whole batch, however many ``vmap``s led to it. Programs on the CPU call it by name
+(``ffi``); those on another backend through JAX's callback, which needs JAX's cpu platform beside it and is slow.
 """
 
+import hashlib
 import os
 import threading
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +18,7 @@ from jaxtyping import Array, Float, Float32
 
 from segvisrl_jax.config import ConfigError, EnvConfig
 from segvisrl_jax.env.model import build_physics_model
-from segvisrl_jax.env.physics import engine
+from segvisrl_jax.env.physics import engine, ffi
 from segvisrl_jax.types import PhysicsState
 
 
@@ -55,6 +57,15 @@ class NativeEngine:
         self._pool = mujoco.rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
         # Programs on several devices may call at once, and the threads' MjData are shared.
         self._lock = threading.Lock()
+        self._target = f"segvisrl_native_{self._fingerprint()}"
+        ffi.register(self._target, self._advance_in_place)
+
+    def _fingerprint(self) -> str:
+        """What ``advance`` computes, as a word that every process gives it: it is in the names of compiled programs."""
+        compiled = np.empty(mujoco.mj_sizeModel(self._model), np.uint8)
+        mujoco.mj_saveModel(self._model, None, compiled)
+        settings = f"{self._stride} {self._num_judgements} {len(self._data)} {mujoco.__version__}"
+        return hashlib.sha256(compiled.tobytes() + settings.encode()).hexdigest()[:16]
 
     def place(self, xy_m: Float32[Array, "2"], yaw_rad: Float32[Array, ""]) -> PhysicsState:
         """See ``PhysicsEngine.place``."""
@@ -65,15 +76,19 @@ class NativeEngine:
         control = engine.wheel_command(action, self._max_wheel_speed).reshape(-1, 4)
         judged = (self._num_judgements,)
         shapes = tuple(jax.ShapeDtypeStruct((*judged, size), jnp.float32) for size in (11, 10))
-        qpos, qvel = jax.pure_callback(
-            self._advance_batch,
-            shapes,
+        qpos, qvel = jax.lax.platform_dependent(
             state.qpos,
             state.qvel,
             control,
-            vmap_method="broadcast_all",
+            cpu=jax.ffi.ffi_call(self._target, shapes, vmap_method="broadcast_all"),
+            default=partial(jax.pure_callback, self._advance_batch, shapes, vmap_method="broadcast_all"),
         )
         return engine.keep_diverged(state, action, PhysicsState(qpos=qpos, qvel=qvel))
+
+    def _advance_in_place(self, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+        """``_advance_batch`` for ``ffi``."""
+        for result, value in zip(results, self._advance_batch(*arguments), strict=True):
+            result[...] = value
 
     def _advance_batch(
         self, qpos: Array, qvel: Array, control: Array
