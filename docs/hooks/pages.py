@@ -12,7 +12,7 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 COMMANDS_PLACE = "<!-- the help of every command -->"
-HELP_WIDTH = 84  # columns: fits the page
+HELP_WIDTH = 80  # columns: fits the page
 DIAGRAM = re.compile(r'<img alt="(?P<alt>[^"]*)" src="(?P<src>[^"]*\.svg)"[^>]*>')
 
 
