@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from segvisrl_jax.config import ConfigError
+from segvisrl_jax.machine.programs import keep_compiled_programs
 
 COMMANDS = {
     "train": "train a policy, evaluate it, draw its learning curve and a video",
@@ -28,6 +29,7 @@ COMMANDS = {
     "runs": "list the runs in a folder: how far they are, how well they drive",
     "doctor": "say whether this machine can do the work, how fast, and what to mend",
 }
+TIMED = ("bench",)  # compiles everything anew: it reports how long that takes
 USAGE_ERROR = 2
 INTERRUPTED = 130
 READER_GONE = 141  # what a shell gives for SIGPIPE: the output went to `head`, which had enough
@@ -50,6 +52,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"segvisrl: {command!r} is not a command; there are: {', '.join(COMMANDS)}", file=sys.stderr)
         return USAGE_ERROR
     _keep_freed_memory()
+    if command not in TIMED:
+        keep_compiled_programs()
     try:
         module = importlib.import_module(f"segvisrl_jax.commands.{command}")
         code = module.run(options)

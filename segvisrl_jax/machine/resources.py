@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from segvisrl_jax.machine.finding import GIB, Finding
+from segvisrl_jax.machine.programs import programs_folder
 
 SECTION = "this machine"
 CGROUP = Path("/sys/fs/cgroup")
@@ -21,6 +22,7 @@ def look(runs_dir: Path, cgroup: Path = CGROUP) -> Iterator[Finding]:
     yield from _load(usable)
     yield _memory(free_memory_bytes(cgroup))
     yield _disk(runs_dir)
+    yield _programs(programs_folder())
 
 
 def usable_cores(cgroup: Path = CGROUP) -> float:
@@ -98,3 +100,13 @@ def _disk(runs_dir: Path) -> Finding:
     if free >= LEAST_DISK_GIB * GIB:
         return Finding(SECTION, name, text)
     return Finding(SECTION, name, text, "problem", "Make room, or name a folder on another disk with --runs-dir.")
+
+
+def _programs(folder: Path) -> Finding:
+    """Compiled programs of earlier commands; whoever wants the room deletes the folder."""
+    sizes = [file.stat().st_size for file in folder.glob("*") if file.is_file()]
+    existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
+    if existing.is_dir() and os.access(existing, os.W_OK | os.X_OK):
+        return Finding(SECTION, "compiled programs", f"{sum(sizes) / 1e6:.0f} MB in {folder} (delete it to make room)")
+    remedy = "Every command compiles anew: name a folder in XDG_CACHE_HOME or JAX_COMPILATION_CACHE_DIR."
+    return Finding(SECTION, "compiled programs", f"{existing} cannot be written to", "note", remedy)

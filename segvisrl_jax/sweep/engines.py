@@ -6,6 +6,7 @@ written on the node and its folder sent back when it ends.
 """
 
 import io
+import logging
 import os
 import secrets
 import signal
@@ -104,7 +105,7 @@ def _connect(address: str) -> Any:
         raise ConfigError('--engine ray needs Ray: pip install "segvisrl_jax[ray]"') from None
     try:
         _require_listener(address)
-        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, ValueError, RuntimeError):
         raise ConfigError(
             f"--ray-address = {address!r}: should be a Ray cluster that answers (start one with: ray start --head)"

@@ -7,7 +7,8 @@ of ``xla/ffi/api/c_api.h`` in jaxlib's include folder, API version 0.3 (XLA supp
 
 import ctypes
 from collections.abc import Callable
-from ctypes import POINTER, Structure, c_char_p, c_int, c_int64, c_size_t, c_uint32, c_void_p
+from ctypes import POINTER, Structure, c_char_p, c_float, c_int, c_int64, c_size_t, c_uint32, c_void_p
+from typing import Any
 
 import jax
 import numpy as np
@@ -24,7 +25,7 @@ class _Extension(Structure):
 
 
 _Extension._fields_ = [("struct_size", c_size_t), ("type", c_int), ("next", POINTER(_Extension))]
-_HEAD = [("struct_size", c_size_t), ("extension_start", POINTER(_Extension))]
+_HEAD: list[Any] = [("struct_size", c_size_t), ("extension_start", POINTER(_Extension))]
 
 
 class _Version(Structure):
@@ -123,8 +124,7 @@ def _array(buffer: _Buffer) -> np.ndarray:
     shape = tuple(buffer.dims[: buffer.rank])
     if 0 in shape:
         return np.empty(shape, np.float32)
-    memory = (ctypes.c_float * int(np.prod(shape, dtype=np.int64))).from_address(buffer.data)
-    return np.frombuffer(memory, np.float32).reshape(shape)
+    return np.ctypeslib.as_array(ctypes.cast(buffer.data, POINTER(c_float)), shape)
 
 
 def _error(frame: _CallFrame, message: str) -> int | None:

@@ -91,7 +91,7 @@ class NativeEngine:
             result[...] = value
 
     def _advance_batch(
-        self, qpos: Array, qvel: Array, control: Array
+        self, qpos: Array | np.ndarray, qvel: Array | np.ndarray, control: Array | np.ndarray
     ) -> tuple[Float32[np.ndarray, "*B J 11"], Float32[np.ndarray, "*B J 10"]]:
         """The callback: any leading axes in, the same and J out. NumPy only: JAX can hang."""
         start = np.concatenate([np.asarray(qpos), np.asarray(qvel)], axis=-1).reshape(-1, 21)

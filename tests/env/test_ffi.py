@@ -1,0 +1,52 @@
+"""NumPy functions called by name from compiled programs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from segvisrl_jax.env.physics import ffi
+
+
+def twice_plus_sum(arguments, results):
+    results[0][...] = 2 * arguments[0] + arguments[1].sum()
+
+
+def called(target, *arguments):
+    shape = jax.ShapeDtypeStruct(arguments[0].shape, jnp.float32)
+    return jax.ffi.ffi_call(target, shape, vmap_method="broadcast_all")(*arguments)
+
+
+def test_arguments_and_results_arrive():
+    ffi.register("test_twice_plus_sum", twice_plus_sum)
+    found = jax.jit(lambda a, b: called("test_twice_plus_sum", a, b))(jnp.arange(3.0), jnp.ones(2))
+    np.testing.assert_array_equal(found, [2, 4, 6])
+
+
+def test_a_batch_is_one_call():
+    shapes = []
+    ffi.register("test_shapes", lambda arguments, results: shapes.append([a.shape for a in arguments + results]))
+    jax.jit(jax.vmap(lambda a: called("test_shapes", a)))(jnp.zeros((5, 3))).block_until_ready()
+    assert shapes == [[(5, 3), (5, 3)]]
+
+
+def test_no_elements_are_no_mistake():
+    ffi.register("test_twice_plus_sum", twice_plus_sum)
+    assert called("test_twice_plus_sum", jnp.zeros((0, 3)), jnp.ones(2)).shape == (0, 3)
+
+
+def test_an_exception_ends_the_program_with_its_message():
+    def refuse(arguments, results):
+        raise ValueError("no such rover")
+
+    ffi.register("test_refuse", refuse)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="test_refuse: ValueError: no such rover"):
+        called("test_refuse", jnp.zeros(3)).block_until_ready()
+    with pytest.raises(jax.errors.JaxRuntimeError, match="float32"):
+        called("test_twice_plus_sum", jnp.zeros(3, jnp.int32), jnp.ones(2)).block_until_ready()
+
+
+def test_the_first_function_of_a_name_stays():
+    ffi.register("test_twice_plus_sum", twice_plus_sum)
+    ffi.register("test_twice_plus_sum", lambda arguments, results: None)
+    np.testing.assert_array_equal(called("test_twice_plus_sum", jnp.ones(1), jnp.zeros(1)), [2])
