@@ -14,6 +14,8 @@ def one_by_one_on_cpu(draw: Callable) -> Callable:
     left out: under the usual vmap, all do what one of them needs.
     """
 
+    draw = jax.jit(draw, inline=True)  # the same program, but JAX traces ``draw`` once and not for every use of it
+
     @jax.custom_batching.custom_vmap
     def drawn(*args):
         return draw(*args)
