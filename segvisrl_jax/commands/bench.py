@@ -23,7 +23,7 @@ from segvisrl_jax.config import (
     require,
 )
 
-Part = Literal["physics", "render", "train"]
+Part = Literal["physics", "render", "train", "start"]
 PlainRenderer = Literal["scanline", "gl", "warp", "mujoco.Renderer"]
 """The project's renderers, and MuJoCo's Python class as one would use it without this project."""
 
@@ -33,7 +33,7 @@ class BenchOptions:
     """Times parts of the pipeline: medians of repeats, compilation apart. Prints tables; JSON where asked."""
 
     parts: tyro.conf.Positional[tuple[Part, ...]] = ("physics", "render", "train")
-    """physics, render, train; all where none is named."""
+    """physics, render, train; these three where none is named. start: what comes before a training's first update."""
     batch: int = 32
     """Environments at once, for physics."""
     batches: tuple[int, ...] = (1, 16, 64, 256)
@@ -62,7 +62,7 @@ class BenchOptions:
 def run(options: Sequence[str]) -> int:
     """Parses, measures, prints a table for each part; writes JSON where asked."""
     asked = parse(BenchOptions, options, "bench")
-    measure = {"physics": _physics, "render": _render, "train": _train}
+    measure = {"physics": _physics, "render": _render, "train": _train, "start": _start}
     before = machine()
     rows: list[dict[str, Any]] = []
     for part in asked.parts:
@@ -182,6 +182,12 @@ def _train(asked: BenchOptions):
         row = learning_row(replace_fields(config, redraw_observations=redraw), asked.repeats)
         observations = "drawn again" if redraw else "kept"
         yield {"name": f"{asked.arch}, {asked.preset}", "observations": observations, **row}
+
+
+def _start(asked: BenchOptions):
+    from segvisrl_jax.machine.start_up import start_rows
+
+    return start_rows(asked.arch, asked.preset)
 
 
 def _env_or_none(config):

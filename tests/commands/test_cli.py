@@ -137,6 +137,17 @@ def test_bench_prints_a_table_and_writes_the_same_numbers(tmp_path):
     assert result["machine"]["cores"] == os.cpu_count()
 
 
+@pytest.mark.slow
+def test_bench_starts_a_training_without_and_with_kept_programs(tmp_path):
+    words = ["--arch", "mlp", "--preset", "smoke", "--json", "b.json"]
+    done = segvisrl("bench", "start", *words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "b.json").read_text())["rows"]
+    assert [row["start"] for row in rows] == ["nothing kept", "programs kept"]
+    assert all(row["first_update_ends_s"] > row["an_update_s"] > 0 for row in rows)
+    assert rows[1]["kept_mb"] >= rows[0]["kept_mb"] > 0.01
+
+
 def test_controllers_need_no_images(tmp_path):
     done = segvisrl("eval", "--controller", "p", "--episodes", "40", "--seed", "3", "--json", "p.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
