@@ -23,7 +23,7 @@ from segvisrl_jax.config import (
     require,
 )
 
-Part = Literal["physics", "render", "train", "start"]
+Part = Literal["physics", "render", "train", "start", "peers"]
 PlainRenderer = Literal["scanline", "gl", "warp", "mujoco.Renderer"]
 """The project's renderers, and MuJoCo's Python class as one would use it without this project."""
 
@@ -33,7 +33,8 @@ class BenchOptions:
     """Times parts of the pipeline: medians of repeats, compilation apart. Prints tables; JSON where asked."""
 
     parts: tyro.conf.Positional[tuple[Part, ...]] = ("physics", "render", "train")
-    """physics, render, train; these three where none is named. start: what comes before a training's first update."""
+    """physics, render, train; these three where none is named. start: what comes before a training's first update.
+    peers: PyTorch and sb3-contrib beside this project (needs the extra [sb3])."""
     batch: int = 32
     """Environments at once, for physics."""
     batches: tuple[int, ...] = (1, 16, 64, 256)
@@ -62,7 +63,7 @@ class BenchOptions:
 def run(options: Sequence[str]) -> int:
     """Parses, measures, prints a table for each part; writes JSON where asked."""
     asked = parse(BenchOptions, options, "bench")
-    measure = {"physics": _physics, "render": _render, "train": _train, "start": _start}
+    measure = {"physics": _physics, "render": _render, "train": _train, "start": _start, "peers": _peers}
     before = machine()
     rows: list[dict[str, Any]] = []
     for part in asked.parts:
@@ -188,6 +189,16 @@ def _start(asked: BenchOptions):
     from segvisrl_jax.machine.start_up import start_rows
 
     return start_rows(asked.arch, asked.preset)
+
+
+def _peers(asked: BenchOptions):
+    from importlib.util import find_spec
+
+    if find_spec("sb3_contrib") is None:
+        raise ConfigError('peers = needs sb3-contrib and PyTorch: `make sb3`, or pip install "segvisrl_jax[sb3]"')
+    from segvisrl_jax.machine.peers import peer_rows
+
+    return peer_rows(preset_config("cnn_lstm", asked.preset), asked.repeats)
 
 
 def _env_or_none(config):
