@@ -26,6 +26,7 @@ INLINE = re.compile(r"(?<!`)`(?P<line>(?:segvisrl|make|python|pytest|pip) [^`]+)
 INLINE_OPTION = re.compile(r"(?<!`)`(?P<line>--[a-z][^`]*)`(?!`)")
 SHELLS = ("bash", "sh", "console")
 PLACEHOLDERS = {"ARCH": "cnn", "COMMAND": "train", "N": "4", "NAME": "cnn", "X": "20", "RUN": "runs/A"}
+MAKES_OWN = ("MAKEFLAGS", "MFLAGS", "MAKEOVERRIDES", "MAKELEVEL", "ARGS")  # of the `make test` that runs this
 ASSIGNMENT = re.compile(r"[A-Z_]+=")
 
 
@@ -155,7 +156,8 @@ def parse_make(words: list[str]) -> None:
     """
     words = [PLACEHOLDERS.get(word, word) for word in words if not word.endswith("...")]
     asked = ["make", "--no-print-directory", "-C", str(ROOT), "-n", *words]
-    said = subprocess.run(asked, capture_output=True, text=True, check=False)
+    ours = {name: value for name, value in os.environ.items() if name not in MAKES_OWN}
+    said = subprocess.run(asked, capture_output=True, text=True, check=False, env=ours)
     if said.returncode:
         raise ValueError(said.stderr.strip())
     for line in said.stdout.splitlines():

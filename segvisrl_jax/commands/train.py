@@ -128,7 +128,7 @@ def _finish(config: TrainConfig, run_dir: Path) -> None:
     from segvisrl_jax.commands.eval import EvalOptions, as_json, evaluate, report_line
     from segvisrl_jax.report.figures import learning_curve
 
-    episodes = min(TEST_EPISODES, 25 * config.evaluation.episodes)
+    episodes = min(TEST_EPISODES, 5 * config.evaluation.episodes)  # fewer after a smoke test
     result = evaluate(EvalOptions(run=run_dir, episodes=episodes, seed=config.seed, slots=config.evaluation.num_slots))
     (run_dir / "eval.json").write_text(as_json(result))
     learning_curve([run_dir], run_dir / "learning_curve.png")
