@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
+from segvisrl_jax.config import ConfigError
 from segvisrl_jax.env.model import WHEEL_NAMES
 from segvisrl_jax.types import ConvexSolids
 
@@ -72,9 +73,9 @@ def _joined(parts: list[trimesh.Trimesh], colour: Colour) -> Solid:
 
 
 def _geom(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
-    """One primitive in its body's frame."""
+    """One geom in its body's frame."""
     kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
-    mesh = _primitive(kind, size)
+    mesh = _mesh(model, model.geom_dataid[geom]) if kind == mujoco.mjtGeom.mjGEOM_MESH else _primitive(kind, size)
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
     placed = np.eye(4)
@@ -83,8 +84,19 @@ def _geom(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
     return mesh.apply_transform(placed)
 
 
+def _mesh(model: mujoco.MjModel, mesh: int) -> trimesh.Trimesh:
+    """One of the model's meshes, in its geom's frame."""
+    corners, triangles = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+    vertices = model.mesh_vert[corners : corners + model.mesh_vertnum[mesh]]
+    return trimesh.Trimesh(vertices, model.mesh_face[triangles : triangles + model.mesh_facenum[mesh]], process=False)
+
+
 def _primitive(kind: mujoco.mjtGeom, size: Float[np.ndarray, "3"]) -> trimesh.Trimesh:
-    """MuJoCo's sizes are halves; its capsules and cylinders lie along z, as trimesh's do."""
+    """MuJoCo's sizes are halves; its capsules and cylinders lie along z, as trimesh's do.
+
+    Raises:
+        ConfigError: for what has no surface of its own: planes, height fields, distance fields.
+    """
     kinds = mujoco.mjtGeom
     radius, half = float(size[0]), float(size[1])
     if kind == kinds.mjGEOM_BOX:
@@ -97,7 +109,8 @@ def _primitive(kind: mujoco.mjtGeom, size: Float[np.ndarray, "3"]) -> trimesh.Tr
     if kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):
         ball = trimesh.creation.icosphere(subdivisions=2)
         return ball.apply_scale(radius if kind == kinds.mjGEOM_SPHERE else size)
-    raise NotImplementedError(f"the viewer draws no geom of type {kind.name}")
+    drawn = "a box, cylinder, capsule, sphere, ellipsoid or mesh, or in group 3, which is not drawn"
+    raise ConfigError(f"rover.xml: a geom of type {kind.name}: should be {drawn}")
 
 
 def _rgb(rgba: Float[np.ndarray, "4"]) -> Colour:

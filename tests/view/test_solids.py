@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("trimesh")  # comes with viser
 
+from segvisrl_jax.config import ConfigError
 from segvisrl_jax.env.rocks import goal_beacon
 from segvisrl_jax.env.rover_env import make_env
 from segvisrl_jax.view import solids
@@ -47,6 +48,27 @@ def test_every_primitive_lies_as_mujoco_says(env):
     for kind, half in expected.items():
         mesh = solids._primitive(kind, size)
         np.testing.assert_allclose(mesh.bounds, [np.negative(half), half], atol=2e-3)
+
+
+WITH_A_MESH = """
+<mujoco>
+  <asset><mesh name="wedge" vertex="0 0 0  0.4 0 0  0 0.2 0  0 0 0.1"/></asset>
+  <worldbody>
+    <body name="rover"><freejoint/><geom type="mesh" mesh="wedge" pos="0.1 0 0.5" euler="0 0 90"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_a_mesh_lies_as_mujoco_says():
+    model = mujoco.MjModel.from_xml_string(WITH_A_MESH)
+    drawn = solids._geom(model, 0)
+    np.testing.assert_allclose(drawn.bounds, [[-0.1, 0.0, 0.5], [0.1, 0.4, 0.6]], atol=1e-6)
+
+
+def test_what_has_no_surface_is_refused_in_words():
+    with pytest.raises(ConfigError, match=r"a geom of type mjGEOM_PLANE: should be a box, .* mesh"):
+        solids._primitive(mujoco.mjtGeom.mjGEOM_PLANE, np.ones(3))
 
 
 def test_bodies_stand_where_the_state_says(env):
