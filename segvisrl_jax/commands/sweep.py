@@ -1,17 +1,21 @@
 """``segvisrl sweep``: one training for each combination of settings; a table and a plot."""
 
 import shlex
+import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from segvisrl_jax.cli import parse
+from segvisrl_jax.cli import INTERRUPTED, parse
 from segvisrl_jax.config import PresetName, require
 
+if TYPE_CHECKING:
+    from segvisrl_jax.sweep.engines import Ended
+    from segvisrl_jax.sweep.plan import Trial
+
 FAILURE = 1
-STOPPED = 130  # the exit code of a training that Ctrl-C stopped
 
 
 @dataclass(frozen=True)
@@ -49,17 +53,18 @@ class SweepOptions:
 def run(options: Sequence[str]) -> int:
     """Parses, checks every trial, trains what is missing, writes table and plot."""
     from segvisrl_jax.commands.train import parse_config
-    from segvisrl_jax.sweep.plan import Trial, check_trials, parse_axis, plan_trials
+    from segvisrl_jax.sweep.plan import check_trials, parse_axis, plan_trials
     from segvisrl_jax.sweep.results import DONE, in_words, result_row, write_csv
 
     asked = parse(SweepOptions, options, "sweep")
     words = ["--preset", asked.preset, *(["--steps", str(asked.steps)] if asked.steps else [])]
-    trials = plan_trials([parse_axis(text) for text in asked.vary], [*words, *shlex.split(asked.args)])
+    axes = [parse_axis(text) for text in asked.vary]
+    trials = plan_trials(axes, [*words, *shlex.split(asked.args)])
     check_trials(trials, asked.output, parse_config)
     asked.output.mkdir(parents=True, exist_ok=True)
     found: dict[str, dict[str, Any]] = {}
 
-    def note(trial: Trial, status: str, node: str) -> str:
+    def note(trial: "Trial", status: str, node: str) -> str:
         found[trial.name] = result_row(trial, asked.output / trial.name, status, node)
         known = [other for other in trials if other.name in found]
         write_csv(asked.output / "results.csv", known, [found[other.name] for other in known])
@@ -70,14 +75,14 @@ def run(options: Sequence[str]) -> int:
         if trial not in missing:
             print(f"  {note(trial, DONE, '')} (already there)")
     _train(asked, missing, note)
-    return _report(asked, [found[trial.name] for trial in trials])
+    return _report(asked, [axis.label for axis in axes], [found[trial.name] for trial in trials])
 
 
 def _is_finished(run_dir: Path) -> bool:
     return (run_dir / "eval.json").is_file()
 
 
-def _train(asked: SweepOptions, missing: Sequence[Any], note: Any) -> None:
+def _train(asked: SweepOptions, missing: "Sequence[Trial]", note: "Callable[[Trial, str, str], str]") -> None:
     """Runs the trials under a bar, with a line for each that ends."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -88,13 +93,13 @@ def _train(asked: SweepOptions, missing: Sequence[Any], note: Any) -> None:
         bar = progress.add_task("sweep", total=len(missing))
         progress.console.print(f"{len(missing)} runs; logs in {asked.output}", highlight=False)
         for trial, ended in _ends(asked, missing):
-            if ended.code in (STOPPED, -2):
+            if ended.code in (INTERRUPTED, -signal.SIGINT):
                 raise KeyboardInterrupt
             progress.console.print(f"  {note(trial, _status(asked, trial, ended), ended.node)}", highlight=False)
             progress.advance(bar)
 
 
-def _ends(asked: SweepOptions, missing: Sequence[Any]) -> Iterator[tuple[Any, Any]]:
+def _ends(asked: SweepOptions, missing: "Sequence[Trial]") -> "Iterator[tuple[Trial, Ended]]":
     from segvisrl_jax.sweep.engines import run_local, run_ray
 
     if asked.engine == "local":
@@ -102,7 +107,7 @@ def _ends(asked: SweepOptions, missing: Sequence[Any]) -> Iterator[tuple[Any, An
     return run_ray(missing, asked.output, asked.ray_address, asked.cpus_per_run, asked.gpus_per_run)
 
 
-def _status(asked: SweepOptions, trial: Any, ended: Any) -> str:
+def _status(asked: SweepOptions, trial: "Trial", ended: "Ended") -> str:
     from segvisrl_jax.sweep.results import DONE
 
     if ended.code == 0 and _is_finished(asked.output / trial.name):
@@ -110,13 +115,12 @@ def _status(asked: SweepOptions, trial: Any, ended: Any) -> str:
     return f"failed ({ended.trouble or ended.code})"
 
 
-def _report(asked: SweepOptions, rows: Sequence[dict[str, Any]]) -> int:
+def _report(asked: SweepOptions, labels: Sequence[str], rows: Sequence[dict[str, Any]]) -> int:
     from segvisrl_jax.report.sweep_figure import sweep_figure
-    from segvisrl_jax.sweep.plan import parse_axis
+    from segvisrl_jax.sweep.results import DONE
 
-    done = [row for row in rows if row["status"] == "done"]
+    done = [row for row in rows if row["status"] == DONE]
     if done:
-        labels = [parse_axis(text).label for text in asked.vary]
         print(f"  {sweep_figure(done, labels, asked.output / 'sweep.png')}")
     print(f"  {asked.output / 'results.csv'}")
     failed = len(rows) - len(done)
