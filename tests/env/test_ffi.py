@@ -50,3 +50,24 @@ def test_the_first_function_of_a_name_stays():
     ffi.register("test_twice_plus_sum", twice_plus_sum)
     ffi.register("test_twice_plus_sum", lambda arguments, results: None)
     np.testing.assert_array_equal(called("test_twice_plus_sum", jnp.ones(1), jnp.zeros(1)), [2])
+
+
+def test_a_program_on_the_cpu_moves_rovers_as_the_callback_of_other_backends_does():
+    from segvisrl_jax.config import EnvConfig
+    from segvisrl_jax.env.physics.native import NativeEngine
+
+    engine, again = NativeEngine(EnvConfig()), NativeEngine(EnvConfig())
+    assert engine._mover is again._mover  # same physics, same threads
+    start = jax.vmap(lambda x: engine.place(jnp.stack([x, -x]), x))(jnp.linspace(-1.0, 1.0, 5))
+    action = jnp.linspace(0.0, 1.0, 10).reshape(5, 2)
+    moved = jax.jit(jax.vmap(engine.advance))(start, action)
+    control = jax.vmap(lambda one: wheels(engine, one))(action)
+    qpos, qvel = engine._mover.advance(start.qpos, start.qvel, control)
+    np.testing.assert_array_equal(moved.qpos, qpos)
+    np.testing.assert_array_equal(moved.qvel, qvel)
+
+
+def wheels(engine, action):
+    from segvisrl_jax.env.physics.engine import wheel_command
+
+    return wheel_command(action, engine._max_wheel_speed).reshape(-1, 4)

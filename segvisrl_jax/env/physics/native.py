@@ -45,27 +45,13 @@ class NativeEngine:
         """
         make_callbacks_safe()
         _require_cpu_platform()
-        self._model = build_physics_model(config)
-        self._rest_height_m = engine.rest_height_m(self._model)
-        self._max_wheel_speed = float(self._model.actuator_ctrlrange[0, 1])
+        model = build_physics_model(config)
+        self._rest_height_m = engine.rest_height_m(model)
+        self._max_wheel_speed = float(model.actuator_ctrlrange[0, 1])
         self._num_judgements = config.task.num_judgements
-        self._stride = engine.steps_per_judgement(config)
         num_threads = config.physics.num_threads or os.cpu_count() or 1
-        self._rest = np.concatenate([self._model.qpos0, np.zeros(self._model.nv)])
-        self._data = [mujoco.MjData(self._model) for _ in range(num_threads)]
-        # With one thread there is no pool: the calling thread does the work.
-        self._pool = mujoco.rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
-        # Programs on several devices may call at once, and the threads' MjData are shared.
-        self._lock = threading.Lock()
-        self._target = f"segvisrl_native_{self._fingerprint()}"
-        ffi.register(self._target, self._advance_in_place)
-
-    def _fingerprint(self) -> str:
-        """What ``advance`` computes, as a word that every process gives it: it is in the names of compiled programs."""
-        compiled = np.empty(mujoco.mj_sizeModel(self._model), np.uint8)
-        mujoco.mj_saveModel(self._model, None, compiled)
-        settings = f"{self._stride} {self._num_judgements} {len(self._data)} {mujoco.__version__}"
-        return hashlib.sha256(compiled.tobytes() + settings.encode()).hexdigest()[:16]
+        stride = engine.steps_per_judgement(config)
+        self._target, self._mover = _shared_mover(model, stride, self._num_judgements, num_threads)
 
     def place(self, xy_m: Float32[Array, "2"], yaw_rad: Float32[Array, ""]) -> PhysicsState:
         """See ``PhysicsEngine.place``."""
@@ -81,19 +67,32 @@ class NativeEngine:
             state.qvel,
             control,
             cpu=jax.ffi.ffi_call(self._target, shapes, vmap_method="broadcast_all"),
-            default=partial(jax.pure_callback, self._advance_batch, shapes, vmap_method="broadcast_all"),
+            default=partial(jax.pure_callback, self._mover.advance, shapes, vmap_method="broadcast_all"),
         )
         return engine.keep_diverged(state, action, PhysicsState(qpos=qpos, qvel=qvel))
 
-    def _advance_in_place(self, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
-        """``_advance_batch`` for ``ffi``."""
-        for result, value in zip(results, self._advance_batch(*arguments), strict=True):
+
+class _Mover:
+    """Moves batches with a model of its own, on threads of its own. NumPy only."""
+
+    def __init__(self, model: mujoco.MjModel, stride: int, num_judgements: int, num_threads: int):
+        self._model, self._stride, self._num_judgements = model, stride, num_judgements
+        self._rest = np.concatenate([model.qpos0, np.zeros(model.nv)])
+        self._data = [mujoco.MjData(model) for _ in range(num_threads)]
+        # With one thread there is no pool: the calling thread does the work.
+        self._pool = mujoco.rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
+        # Programs on several devices may call at once, and the threads' MjData are shared.
+        self._lock = threading.Lock()
+
+    def advance_in_place(self, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+        """``advance`` for ``ffi``."""
+        for result, value in zip(results, self.advance(*arguments), strict=True):
             result[...] = value
 
-    def _advance_batch(
+    def advance(
         self, qpos: Array | np.ndarray, qvel: Array | np.ndarray, control: Array | np.ndarray
     ) -> tuple[Float32[np.ndarray, "*B J 11"], Float32[np.ndarray, "*B J 10"]]:
-        """The callback: any leading axes in, the same and J out. NumPy only: JAX can hang."""
+        """Any leading axes in, the same and J out."""
         start = np.concatenate([np.asarray(qpos), np.asarray(qvel)], axis=-1).reshape(-1, 21)
         controls = np.asarray(control).reshape(len(start), -1, 4)
         if controls.shape[1] > 1:
@@ -124,6 +123,21 @@ class NativeEngine:
         steps_done = np.rint(judged[..., 0] / self._model.opt.timestep)
         steps_due = self._stride * np.arange(1, self._num_judgements + 1)
         return np.where((steps_done == steps_due)[..., None], judged[..., 1:], np.nan)
+
+
+_movers: dict[str, _Mover] = {}  # by target: environments with the same physics share model and threads
+
+
+def _shared_mover(model: mujoco.MjModel, stride: int, num_judgements: int, num_threads: int) -> tuple[str, _Mover]:
+    """The mover of some physics, and the name by which programs on the CPU call it: the same in every process."""
+    compiled = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, compiled)
+    settings = f"{stride} {num_judgements} {num_threads} {mujoco.__version__}"
+    target = "segvisrl_native_" + hashlib.sha256(compiled.tobytes() + settings.encode()).hexdigest()[:16]
+    if target not in _movers:
+        _movers[target] = _Mover(model, stride, num_judgements, num_threads)
+        ffi.register(target, _movers[target].advance_in_place)
+    return target, _movers[target]
 
 
 def _require_cpu_platform() -> None:
