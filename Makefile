@@ -39,7 +39,7 @@ $(READY): requirements.lock pyproject.toml
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
 
-extras: $(EXTRAS_READY) ## add what view, warp, sweeps on Ray, notebooks and docs need to .venv (0.7 GB); their tests run from then on
+extras: $(EXTRAS_READY) ## add what view, warp, sweeps on Ray, notebooks, docs, mlflow and wandb need to .venv (0.9 GB); their tests run from then on
 
 $(EXTRAS_READY): requirements-extras.lock $(READY)
 	@echo "Adding the extras to $(VENV) from requirements-extras.lock (once)"
@@ -103,7 +103,7 @@ notebooks: $(EXTRAS_READY) ## run NOTEBOOKS of experiments/ and write them with 
 RESOLVE := uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate --no-header
 
 lock: $(READY) ## resolve pyproject.toml anew into the two locks (needs uv on the path)
-	$(RESOLVE) --upgrade --extra dev --extra warp --extra view --extra ray --extra notebooks --extra docs pyproject.toml -o requirements-extras.lock
+	$(RESOLVE) --upgrade --extra dev --extra warp --extra view --extra ray --extra notebooks --extra docs --extra mlflow --extra wandb pyproject.toml -o requirements-extras.lock
 	$(RESOLVE) --extra dev --constraints requirements-extras.lock pyproject.toml -o requirements.lock
 
 clean: ## remove the environment and caches; runs stay
