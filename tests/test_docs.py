@@ -96,23 +96,18 @@ def patched(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReq
     return copy
 
 
-def plain_blocks(name: str, slow: bool) -> list[Block]:
-    """A page's blocks of Python that need no extra, of one kind."""
-    found = [block for block in python_blocks(name) if not optional_packages(block)]
-    return [block for block in found if (block.mark == "slow") == slow]
-
-
-@pytest.mark.parametrize("name", [name for name in PLAIN if plain_blocks(name, slow=False)])
-def test_python_blocks_run(name: str, workplace: Path):
-    run_blocks(name, plain_blocks(name, slow=False))
+def plain_blocks(name: str) -> list[Block]:
+    """A page's blocks of Python that need no extra."""
+    return [block for block in python_blocks(name) if not optional_packages(block)]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in PLAIN if plain_blocks(name, slow=True)])
-def test_slow_python_blocks_run(name: str, workplace: Path):
-    run_blocks(name, plain_blocks(name, slow=True))
+@pytest.mark.parametrize("name", [name for name in PLAIN if plain_blocks(name)])
+def test_python_blocks_run(name: str, workplace: Path):
+    run_blocks(name, plain_blocks(name))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "number"),
     [(name, i) for name in PLAIN for i, block in enumerate(python_blocks(name)) if optional_packages(block)],
@@ -245,6 +240,7 @@ def test_mistakes_are_found(workplace: Path):
         "train --env.scene.num-rocks 500",
         "evaluate --policy cnn",
         "bench --parts physics",
+        "sweep --vary scal=20",
     ):
         assert complaint_about(Command(("segvisrl", *line.split()), 1)), line
     for line in ("make trian", "make train ARGS=--evaluation.rock", "pip install .[wnadb]", "python experiments/no.py"):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from segvisrl_jax.cli import INTERRUPTED, parse
 from segvisrl_jax.config import PresetName, require
+from segvisrl_jax.sweep.plan import parse_axis
 
 if TYPE_CHECKING:
     from segvisrl_jax.sweep.engines import Ended
@@ -44,6 +45,8 @@ class SweepOptions:
     """ray: GPUs that a run takes of its node; 0.25 lets four runs share one."""
 
     def __post_init__(self) -> None:
+        for text in self.vary:
+            parse_axis(text)
         require(1 <= self.jobs <= 1024, "--jobs", self.jobs, "in [1, 1024]")
         require(self.steps is None or self.steps > 0, "--steps", self.steps, "above 0")
         require(0 < self.cpus_per_run <= 4096, "--cpus-per-run", self.cpus_per_run, "in (0, 4096]")
@@ -53,7 +56,7 @@ class SweepOptions:
 def run(options: Sequence[str]) -> int:
     """Parses, checks every trial, trains what is missing, writes table and plot."""
     from segvisrl_jax.commands.train import parse_config
-    from segvisrl_jax.sweep.plan import check_trials, parse_axis, plan_trials
+    from segvisrl_jax.sweep.plan import check_trials, plan_trials
     from segvisrl_jax.sweep.results import DONE, in_words, result_row, write_csv
 
     asked = parse(SweepOptions, options, "sweep")
