@@ -72,16 +72,16 @@ bench: $(READY) ## measure physics, rendering and learning on this machine
 	@$(BIN)/segvisrl bench $(ARGS)
 
 test: $(READY) ## the whole suite, on the CPU, in WORKERS processes
-	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -n $(WORKERS) $(ARGS)
+	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
 
 test-fast: $(READY) ## the edit loop: everything but the slow tests
-	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -n $(WORKERS) -m "not slow" $(ARGS)
+	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow" $(ARGS)
 
 check: $(READY) ## format, lint, types, fast tests (TESTED=1: without the tests)
 	@$(BIN)/ruff format --check .
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy
-	@$(if $(TESTED),,JAX_PLATFORMS=cpu $(BIN)/python -m pytest -q -n $(WORKERS) -m "not slow")
+	@$(if $(TESTED),,JAX_PLATFORMS=cpu $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile -m "not slow")
 
 format: $(READY) ## rewrite the code in the project's format
 	@$(BIN)/ruff format .

@@ -45,6 +45,10 @@ FIGURES = (  # of evaluations, runs and policies, which ``material`` makes: run 
         False,
     ),
 )
+RUN_ELSEWHERE = (  # by the tests of notebooks, and of the viewer
+    Experiment("quickstart.py", pictures=("what_it_sees.png", "learning_curve.png")),
+    Experiment("view_picture.py", pictures=("view.png",)),
+)
 BESIDE = {  # what else a script writes
     "learning_curves.py": {"learning_curves.csv"},
     "visual_gap.py": {"visual_gap.json", "visual_gap_views.png"},
@@ -213,8 +217,8 @@ def test_help_names_the_script_and_its_options(script, monkeypatch, capsys):
 
 def test_every_script_is_run_here_and_says_how_to_run_it():
     scripts = sorted(path.name for path in FOLDER.glob("*.py"))
-    assert scripts == sorted(experiment.script for experiment in (*EXPERIMENTS, *FIGURES))
-    for experiment in (*EXPERIMENTS, *FIGURES):
+    assert scripts == sorted(experiment.script for experiment in (*EXPERIMENTS, *FIGURES, *RUN_ELSEWHERE))
+    for experiment in (*EXPERIMENTS, *FIGURES, *RUN_ELSEWHERE):
         code = (FOLDER / experiment.script).read_text()
         assert code.startswith("# %% [markdown]\n# # ")
         assert f"`python experiments/{experiment.script} [" in code

@@ -18,7 +18,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from segvisrl_jax.adapters.stable_baselines3 import LunarRoverVecEnv
-from segvisrl_jax.config import ConfigError, NetworkConfig, TrainConfig, replace_fields, to_dict
+from segvisrl_jax.config import ConfigError, NetworkConfig, TrainConfig, replace_fields
 from segvisrl_jax.env.rover_env import observation_shape
 from segvisrl_jax.machine.speed import learning_row
 
@@ -153,8 +153,9 @@ def sb3_decisions_per_s(preset: TrainConfig) -> tuple[float, str]:
     That is MuJoCo's own (``gl``), as in any Gymnasium environment on MuJoCo; ``scanline`` where OpenGL is missing.
     """
     ppo, network = preset.ppo, preset.network
-    scene = to_dict(preset.env.scene)
-    fields = {"num_rocks": scene["num_rocks"], "scale": preset.env.camera.scale, "physics": "native"}
+    scene, camera = preset.env.scene, preset.env.camera
+    sees = {"width_px": camera.width_px, "height_px": camera.height_px, "scale": camera.scale}
+    fields = {"num_rocks": scene.num_rocks, "physics": "native", **sees}
     renderer = "gl"
     try:
         rovers = LunarRoverVecEnv(ppo.num_envs, renderer=renderer, **fields)

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Int, Int32, UInt8
 from segvisrl_jax.config import EnvConfig, require
 from segvisrl_jax.env.rocks import concatenate_solids, goal_beacon, rock_library
 from segvisrl_jax.types import CameraPose, Conditions, Scene
-from segvisrl_jax.vision.batching import one_by_one_on_cpu
+from segvisrl_jax.vision.batching import by_platform, one_by_one_on_cpu
 from segvisrl_jax.vision.borders import grown_box, grown_spans
 from segvisrl_jax.vision.classes import SegmentationClass
 from segvisrl_jax.vision.painting import (
@@ -128,10 +128,10 @@ class ScanlineRenderer:
     # Two ways to the same image: a CPU paints what is seen, solid by solid; an accelerator all solids at once.
 
     def _draw_classes(self, scene: Scene, camera: CameraPose) -> ClassRows:
-        return jax.lax.platform_dependent(scene, camera, cpu=self._paint_seen_classes, default=self._paint_all_classes)
+        return by_platform(scene, camera, cpu=self._paint_seen_classes, default=self._paint_all_classes)
 
     def _draw_rgb(self, scene: Scene, camera: CameraPose) -> UInt8[Array, "rows columns 3"]:
-        paint = jax.lax.platform_dependent(scene, camera, cpu=self._paint_seen, default=self._paint_all)
+        paint = by_platform(scene, camera, cpu=self._paint_seen, default=self._paint_all)
         return self._surfaces.paint(paint.light, paint.kind)
 
     def _paint_seen_classes(self, scene: Scene, camera: CameraPose) -> ClassRows:

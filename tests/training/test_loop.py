@@ -1,6 +1,7 @@
 """Training runs end to end, leaves its files, and goes on bit by bit where it stopped."""
 
 import json
+import shutil
 import signal
 
 import jax
@@ -9,10 +10,10 @@ import pytest
 
 from segvisrl_jax.config import ConditionsConfig, ConfigError, preset_config, replace_fields
 from segvisrl_jax.training import loop
-from segvisrl_jax.training.checkpoint import Checkpoints, load_policy
+from segvisrl_jax.training.checkpoint import Checkpoints, load_policy, save_policy
 from segvisrl_jax.training.metrics import read_metrics
 
-TINY = {"num_envs": 4, "unroll_length": 8, "num_minibatches": 2, "num_epochs": 2, "episodes": 4, "num_slots": 4}
+TINY = {"max_decisions": 12, "num_envs": 4, "unroll_length": 8, "num_minibatches": 2, "num_epochs": 2, "episodes": 4, "num_slots": 4}
 TINY_NETWORK = {"channels": (4, 4), "blocks_per_stage": 1, "feature_size": 16, "lstm_size": 8}
 QUIET = {"say": lambda line: None}
 
@@ -22,6 +23,21 @@ def tiny(arch, runs_dir, updates, **fields):
     named = {**TINY, **TINY_NETWORK, "steps": steps, "scale": 120.0, "engine": "native"}
     named |= {"every_decisions": 64, "checkpoint_every_updates": 2, "runs_dir": str(runs_dir), **fields}
     return replace_fields(preset_config(arch, "smoke"), **named)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run of two updates."""
+    folder = tmp_path_factory.mktemp("trained")
+    loop.train(tiny("mlp", folder, updates=2, run="run"), **QUIET)
+    return folder / "run"
+
+
+@pytest.fixture
+def config(trained, tmp_path):
+    """The settings of such a run, and a copy of it."""
+    shutil.copytree(trained, tmp_path / "run")
+    return tiny("mlp", tmp_path, updates=2, run="run")
 
 
 def final_state(config):
@@ -81,17 +97,15 @@ def stop_after(config, updates):
         loop.Trainer.update = original
 
 
-def test_training_starts_from_a_policy_where_one_is_named(tmp_path):
-    config = tiny("mlp", tmp_path, updates=2, run="first")
-    loop.train(config, **QUIET)
-    policy = str(tmp_path / "first" / "policy")
+def test_training_starts_from_a_policy_where_one_is_named(config, tmp_path):
+    policy = str(tmp_path / "run" / "policy")
     _, params, _ = load_policy(loop.Path(policy))
     more = replace_fields(config, start_from=policy, run="second", learning_rate=1e-9)
     loop.train(more, **QUIET)
     again, moved, _ = load_policy(tmp_path / "second" / "policy")
     for a, b in zip(as_arrays(params), as_arrays(moved), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
-    assert again.start_from == "first"  # its name, and no folder of this machine
+    assert again.start_from == "run"  # its name, and no folder of this machine
     assert again.runs_dir == "runs"
 
 
@@ -100,18 +114,15 @@ def test_training_starts_from_a_policy_where_one_is_named(tmp_path):
     [({"mlp_sizes": (9,)}, "network"), ({"scale": 60.0}, "observations"), ({"start_from": "nowhere"}, "policy.json")],
 )
 def test_a_policy_that_does_not_fit_is_refused_before_anything_is_made(field, message, tmp_path):
-    config = tiny("cnn_lstm", tmp_path, updates=2, run="first")
-    loop.train(config, **QUIET)
-    more = replace_fields(config, **{"start_from": str(tmp_path / "first" / "policy"), "run": "second"} | field)
+    config = tiny("cnn_lstm", tmp_path, updates=2)
+    save_policy(tmp_path / "policy", config, loop.Trainer(config).network.init(jax.random.key(0)), {})
+    more = replace_fields(config, **{"start_from": str(tmp_path / "policy"), "run": "second"} | field)
     with pytest.raises(ConfigError, match=message):
         loop.train(more, **QUIET)
     assert not (tmp_path / "second").exists()
 
 
-def test_a_run_leaves_its_files(tmp_path):
-    config = tiny("mlp", tmp_path, updates=2, run="run")
-    result = loop.train(config, **QUIET)
-    assert result.decisions == 64
+def test_a_run_leaves_its_files(config, tmp_path):
     assert json.loads((tmp_path / "run" / "config.json").read_text())["ppo"]["num_envs"] == 4
     lines = read_metrics(tmp_path / "run")
     assert {"ppo/entropy", "ppo/explained_variance", "time/decisions_per_second"} <= set(lines[0])
@@ -123,9 +134,7 @@ def test_a_run_leaves_its_files(tmp_path):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
 
 
-def test_an_existing_run_is_not_overwritten(tmp_path):
-    config = tiny("mlp", tmp_path, updates=1, run="run")
-    loop.train(config, **QUIET)
+def test_an_existing_run_is_not_overwritten(config, tmp_path):
     before = (tmp_path / "run" / "metrics.jsonl").read_bytes()
     with pytest.raises(ConfigError, match=r"exists already.*--resume"):
         loop.train(config, **QUIET)
@@ -140,25 +149,21 @@ def test_an_existing_run_is_not_overwritten(tmp_path):
         ({"seed": 9}, "seed = 9.*should be 0"),
     ],
 )
-def test_a_run_goes_on_only_as_itself(change, says, tmp_path):
-    config = tiny("mlp", tmp_path, updates=1, run="run")
-    loop.train(config, **QUIET)
+def test_a_run_goes_on_only_as_itself(change, says, config):
     with pytest.raises(ConfigError, match=says):
-        loop.train(replace_fields(config, resume=True, steps=64, **change), **QUIET)
+        loop.train(replace_fields(config, resume=True, steps=96, **change), **QUIET)
 
 
-def test_a_run_from_before_there_were_conditions_goes_on(tmp_path):
+def test_a_run_from_before_there_were_conditions_goes_on(config, tmp_path):
     """Such a run's settings do not name them, and its checkpoint has no place for them."""
-    config = tiny("mlp", tmp_path, updates=1, run="run")
-    loop.train(config, **QUIET)
     file = tmp_path / "run" / "config.json"
     settings = json.loads(file.read_text())
     del settings["env"]["conditions"]
     file.write_text(json.dumps(settings))
-    going_on = replace_fields(config, resume=True, steps=64)
+    going_on = replace_fields(config, resume=True, steps=96)
     with pytest.raises(ConfigError, match=r"env\.conditions\.left_wheel_gain = 0.5: should be 1.0"):
         loop.train(replace_fields(going_on, left_wheel_gain=0.5), **QUIET)
-    assert loop.train(going_on, **QUIET).decisions == 64
+    assert loop.train(going_on, **QUIET).decisions == 96
 
 
 def test_nothing_to_resume_is_said(tmp_path):
@@ -167,9 +172,7 @@ def test_nothing_to_resume_is_said(tmp_path):
     assert not (tmp_path / "none").exists()
 
 
-def test_a_checkpoint_of_another_architecture_is_refused(tmp_path):
-    config = tiny("mlp", tmp_path, updates=1, run="run")
-    loop.train(config, **QUIET)
+def test_a_checkpoint_of_another_architecture_is_refused(config, tmp_path):
     other = replace_fields(preset_config("cnn", "smoke"), runs_dir=str(tmp_path), run="run", resume=True)
     with pytest.raises(ConfigError, match=r"arch = 'cnn': should be 'mlp'"):
         loop.train(other, **QUIET)

@@ -13,6 +13,7 @@ from segvisrl_jax.config import CameraConfig, EnvConfig
 from segvisrl_jax.env.rocks import rock_library
 from segvisrl_jax.env.scene import sample_scene
 from segvisrl_jax.types import Conditions
+from segvisrl_jax.vision import batching
 from segvisrl_jax.vision.classes import SegmentationClass
 from segvisrl_jax.vision.scanline import ScanlineRenderer
 
@@ -89,6 +90,7 @@ def test_what_is_smaller_than_twice_the_border_vanishes():
 def test_an_accelerators_way_gives_the_same_borders(monkeypatch):
     scene, camera = scene_with([(1.5, 0.1), (3.0, 0.5)], (5.0, 0.7), 4), camera_at((0.0, 0.0))
     expected = drawing()(scene, camera)
+    monkeypatch.setattr(batching, "backends", lambda: ["cpu", "cuda"])
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, cpu, default: default(*args))
     other = ScanlineRenderer(CONFIG, np.arange(HEIGHT), np.arange(WIDTH))
     np.testing.assert_array_equal(jax.jit(other.classes)(scene, camera), expected)

@@ -17,6 +17,7 @@ from segvisrl_jax.env.model import build_physics_model, camera_mount, camera_pos
 from segvisrl_jax.env.rocks import BEACON_RADIUS_M, rock_library
 from segvisrl_jax.env.scene import sample_scene
 from segvisrl_jax.types import CameraPose, PhysicsState, Scene
+from segvisrl_jax.vision import batching
 from segvisrl_jax.vision.classes import SegmentationClass
 from segvisrl_jax.vision.gl import GlRenderer
 from segvisrl_jax.vision.projection import Projection
@@ -275,6 +276,7 @@ def test_scan_and_vmap_are_one_by_one(drive):
 @pytest.mark.parametrize("kind", ["classes", "rgb"])
 def test_an_accelerators_way_gives_the_same_images(drive, kind, monkeypatch):
     mapped = jax.jit(jax.vmap(getattr(drive.renderer, kind), in_axes=(None, 0)))(drive.scene, drive.stacked(3))
+    monkeypatch.setattr(batching, "backends", lambda: ["cpu", "cuda"])
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, cpu, default: default(*args))
     other = ScanlineRenderer(EnvConfig(), PLAN.rows, PLAN.columns)
     batched = jax.jit(jax.vmap(getattr(other, kind), in_axes=(None, 0)))(drive.scene, drive.stacked(3))
@@ -283,8 +285,10 @@ def test_an_accelerators_way_gives_the_same_images(drive, kind, monkeypatch):
         assert max(np.max(np.abs(np.asarray(image, int) - single)) for image in images) <= rounding(kind)
 
 
-def test_lowers_for_an_accelerator(drive):
-    for draw in (drive.renderer.classes, drive.renderer.rgb):
+def test_lowers_for_an_accelerator(drive, monkeypatch):
+    monkeypatch.setattr(batching, "backends", lambda: ["cpu", "cuda"])
+    renderer = ScanlineRenderer(EnvConfig(), PLAN.rows, PLAN.columns)
+    for draw in (renderer.classes, renderer.rgb):
         program = jax.jit(jax.vmap(draw, in_axes=(None, 0)))
         exported = jax.export.export(program, platforms=["cuda"])(drive.scene, drive.stacked(2))
         assert exported.platforms == ("cuda",)
