@@ -154,8 +154,8 @@ def sb3_decisions_per_s(preset: TrainConfig) -> tuple[float, str]:
     """
     ppo, network = preset.ppo, preset.network
     scene, camera = preset.env.scene, preset.env.camera
-    sees = {"width_px": camera.width_px, "height_px": camera.height_px, "scale": camera.scale}
-    fields = {"num_rocks": scene.num_rocks, "physics": "native", **sees}
+    sees: dict[str, Any] = {"width_px": camera.width_px, "height_px": camera.height_px, "scale": camera.scale}
+    fields: dict[str, Any] = {"num_rocks": scene.num_rocks, "physics": "native", **sees}
     renderer = "gl"
     try:
         rovers = LunarRoverVecEnv(ppo.num_envs, renderer=renderer, **fields)

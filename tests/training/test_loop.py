@@ -13,7 +13,15 @@ from segvisrl_jax.training import loop
 from segvisrl_jax.training.checkpoint import Checkpoints, load_policy, save_policy
 from segvisrl_jax.training.metrics import read_metrics
 
-TINY = {"max_decisions": 12, "num_envs": 4, "unroll_length": 8, "num_minibatches": 2, "num_epochs": 2, "episodes": 4, "num_slots": 4}
+TINY = {
+    "max_decisions": 12,
+    "num_envs": 4,
+    "unroll_length": 8,
+    "num_minibatches": 2,
+    "num_epochs": 2,
+    "episodes": 4,
+    "num_slots": 4,
+}
 TINY_NETWORK = {"channels": (4, 4), "blocks_per_stage": 1, "feature_size": 16, "lstm_size": 8}
 QUIET = {"say": lambda line: None}
 

@@ -1,5 +1,6 @@
 """``segvisrl view``: mistakes get one line; in a real browser the page drives, listens to keys, and lets one drag."""
 
+import functools
 import shutil
 import signal
 import socket
@@ -238,7 +239,8 @@ def test_a_port_in_use_gets_one_line(capsys):
 def test_ctrl_c_ends_it_quietly():
     """One line, with the address, and exit code 0."""
     command = [sys.executable, "-m", "segvisrl_jax.cli", "view", "--policy", "mlp", "--port", "0"]
-    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    heed = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # what runs in the background ignores it
+    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed)
     line = program.stdout.readline()
     assert line.startswith("http://127.0.0.1:"), line
     program.send_signal(signal.SIGINT)
