@@ -20,6 +20,10 @@ from segvisrl_jax.config import ConfigError
 
 OPTIONAL = {"stable_baselines3": "make sb3", "onnxruntime": "the extra onnx", "onnx": "the extra onnx"}
 SMALLER = {"--episodes": "8", "--scenes": "1", "--videos": "0"}  # the options that decide how long a command runs
+SHORTER = {  # episodes, and so evaluations and videos
+    "train": ["--env.task.max-decisions", "20"],
+    "sweep": ["--args=--env.task.max-decisions 20"],
+}
 TINY = {  # in this order
     "LunarRoverVecEnv(16)).learn(100_000)": "LunarRoverVecEnv(2, scale=30), n_steps=8, batch_size=8).learn(16)",
     "LunarRoverVecEnv(16), n_steps=64, batch_size=128": "LunarRoverVecEnv(2, scale=30), n_steps=8, batch_size=8",
@@ -66,9 +70,8 @@ def run_blocks(name: str, chosen: list[Block]) -> None:
 def smaller(words: tuple[str, ...]) -> list[str]:
     """A command at a size that a test can afford."""
     asked = list(words)
-    if words[:2] in (("segvisrl", "train"), ("segvisrl", "sweep")):
-        short = "--env.task.max-decisions 20"
-        asked += short.split() if words[1] == "train" else [f"--args={short}"]
+    if words[0] == "segvisrl":
+        asked += SHORTER.get(words[1], [])
     for option, value in SMALLER.items():
         if option in asked:
             asked[asked.index(option) + 1] = value

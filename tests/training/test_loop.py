@@ -37,7 +37,7 @@ def tiny(arch, runs_dir, updates, **fields):
 def trained(tmp_path_factory):
     """A run of two updates."""
     folder = tmp_path_factory.mktemp("trained")
-    loop.train(tiny("mlp", folder, updates=2, run="run"), **QUIET)
+    assert loop.train(tiny("mlp", folder, updates=2, run="run"), **QUIET).decisions == 64
     return folder / "run"
 
 
