@@ -83,7 +83,14 @@ def ppo_loss(
     The approximate KL divergence from the old to the new policy is mean(ratio - 1 - log ratio).
     """
     observation = batch.observation if draw is None else draw(batch.observation)
-    _, output = network.unroll(params, batch.carry, observation, batch.reset)
+    return loss_of_maps(params, network.maps(params, observation), batch, network, config)
+
+
+def loss_of_maps(
+    params: Params, maps: Float32[Array, "T B M"], batch: Batch, network: Network, config: PPOConfig
+) -> tuple[Float32[Array, ""], LossTerms]:
+    """``ppo_loss`` from what ``network.maps`` made of the observations."""
+    _, output = network.unroll_maps(params, batch.carry, maps, batch.reset)
     distribution = DiagonalGaussian(output.mean, output.log_std)
     log_ratio = distribution.log_prob(batch.action) - batch.log_prob
     ratio = jnp.exp(log_ratio)

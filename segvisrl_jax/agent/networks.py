@@ -76,18 +76,32 @@ class ImpalaCNN(nn.Module):
     blocks_per_stage: int
     feature_size: int
 
-    @nn.compact
+    def setup(self) -> None:
+        """Builds the layers, named as flax would number them."""
+        blocks = range(self.blocks_per_stage)
+        for stage, channels in enumerate(self.channels):
+            setattr(self, f"Conv_{stage}", _convolution(channels))
+            for block in blocks:
+                setattr(self, f"ResidualBlock_{stage * len(blocks) + block}", ResidualBlock(channels))
+        self.Dense_0 = _dense(self.feature_size)
+
     def __call__(self, images: UInt8[Array, "*B H W C"]) -> Float32[Array, "*B F"]:
         """Features of every image; the leading axes are flattened for the convolutions."""
+        return self.summary(self.maps(images))
+
+    def maps(self, images: UInt8[Array, "*B H W C"]) -> Float32[Array, "*B M"]:
+        """What the convolutions make of every image."""
         batch_shape = images.shape[:-3]
-        features = images.reshape((-1, *images.shape[-3:])).astype(jnp.float32) / PIXEL_MAX
-        for channels in self.channels:
-            features = max_pool(_convolution(channels)(features))
-            for _ in range(self.blocks_per_stage):
-                features = ResidualBlock(channels)(features)
-        features = nn.relu(features).reshape((features.shape[0], -1))
-        features = nn.relu(_dense(self.feature_size)(features))
-        return features.reshape((*batch_shape, self.feature_size))
+        maps = images.reshape((-1, *images.shape[-3:])).astype(jnp.float32) / PIXEL_MAX
+        for stage in range(len(self.channels)):
+            maps = max_pool(getattr(self, f"Conv_{stage}")(maps))
+            for block in range(self.blocks_per_stage):
+                maps = getattr(self, f"ResidualBlock_{stage * self.blocks_per_stage + block}")(maps)
+        return nn.relu(maps).reshape((*batch_shape, -1))
+
+    def summary(self, maps: Float32[Array, "*B M"]) -> Float32[Array, "*B F"]:
+        """Features from ``maps``."""
+        return nn.relu(self.Dense_0(maps))
 
 
 class MLP(nn.Module):
@@ -95,8 +109,16 @@ class MLP(nn.Module):
 
     sizes: tuple[int, ...]
 
-    @nn.compact
     def __call__(self, vector: Float32[Array, "*B D"]) -> Float32[Array, "*B F"]:
+        """Features of every vector."""
+        return self.summary(self.maps(vector))
+
+    def maps(self, vector: Float32[Array, "*B D"]) -> Float32[Array, "*B D"]:
+        """The vector: there is nothing to convolve."""
+        return vector
+
+    @nn.compact
+    def summary(self, vector: Float32[Array, "*B D"]) -> Float32[Array, "*B F"]:
         """Features of every vector."""
         for size in self.sizes:
             vector = nn.relu(_dense(size)(vector))
@@ -133,7 +155,17 @@ class ActorCritic(nn.Module):
         self, carry: Carry, observation: Shaped[Array, "T B ..."], reset: Float32[Array, "T B"]
     ) -> tuple[Carry, PolicyOutput]:
         """T decisions of B environments, from the carry before the first one."""
-        features = self.body(observation)
+        return self.unroll_maps(carry, self.maps(observation), reset)
+
+    def maps(self, observation: Shaped[Array, "..."]) -> Float32[Array, "*B M"]:
+        """What the convolutions make of observations; the observations themselves where there are none."""
+        return self.body.maps(observation)
+
+    def unroll_maps(
+        self, carry: Carry, maps: Float32[Array, "T B M"], reset: Float32[Array, "T B"]
+    ) -> tuple[Carry, PolicyOutput]:
+        """``unroll`` from what ``maps`` made of the observations."""
+        features = self.body.summary(maps)
         if has_memory(self.arch):
             carry, features = self.memory.unroll(carry, features, reset)
         return carry, self._heads(features)
@@ -189,6 +221,21 @@ class Network:
     ) -> tuple[Carry, PolicyOutput]:
         """``ActorCritic.unroll``."""
         return self.module.apply(params, carry, observation, reset, method="unroll")  # type: ignore[return-value]
+
+    def maps(self, params: Params, observation: Shaped[Array, "..."]) -> Float32[Array, "*B M"]:
+        """``ActorCritic.maps``."""
+        return self.module.apply(params, observation, method="maps")  # type: ignore[return-value]
+
+    def unroll_maps(
+        self, params: Params, carry: Carry, maps: Float32[Array, "T B M"], reset: Float32[Array, "T B"]
+    ) -> tuple[Carry, PolicyOutput]:
+        """``ActorCritic.unroll_maps``."""
+        return self.module.apply(params, carry, maps, reset, method="unroll_maps")  # type: ignore[return-value]
+
+    def convolutional(self, params: Params) -> Params:
+        """The part of the parameters, or of a gradient, that ``maps`` reads: {layer's name: its leaves}."""
+        layers = params["params"]["body"].items()
+        return {name: leaves for name, leaves in layers if not name.startswith("Dense")}
 
     def initial_carry(self, batch_shape: tuple[int, ...]) -> Carry:
         """``ActorCritic.initial_carry``."""

@@ -1,18 +1,21 @@
 """Proximal policy optimisation (Schulman et al., 2017) of a recurrent policy: epochs and steps.
 
 One ``Learner``, two ways to run it, one result. ``fused``: the whole update is one compiled
-program, for accelerators. ``host``: Python drives the minibatches, since XLA on a CPU runs
-convolution gradients inside a loop many times slower than outside it; every core takes chunks of
-whole environments, which is faster than all cores at one convolution, and their gradients are added in a
-fixed order. The loss is in loss.py; acting is not here (training/rollout.py).
+program, for accelerators. ``host``: Python drives the minibatches, since XLA on a CPU runs convolutions inside a loop
+many times slower than outside it. Every core takes a few images at a time through the convolutions, forward and later
+backward, which fit its cache and are faster than all cores at one convolution; the memory and the loss between
+the two take whole environments. Gradients are added in a fixed order.
+The loss is in loss.py; acting is not here (training/rollout.py).
 """
 
 import dataclasses
 import functools
+import math
 import os
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +25,13 @@ from flax import struct
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float32, Int32
 
+from segvisrl_jax.agent.convolution import CONVOLVED
 from segvisrl_jax.agent.loss import (
     Batch,
     Draw,
     LossTerms,
     Trajectory,
+    loss_of_maps,
     make_batch,
     ppo_loss,
     take_environments,
@@ -37,15 +42,16 @@ from segvisrl_jax.config import PPOConfig, require
 Execution = Literal["auto", "host", "fused"]
 Metrics = dict[str, Float32[Array, ""]]
 Total = tuple[Params, LossTerms]  # sums of gradient and loss terms over chunks
+Pullback = Callable[[Array], tuple[Params]]  # from jax.vjp: a pytree
 
 ADAM_EPSILON = 1e-5  # usual for PPO (Huang et al., 2022, "The 37 implementation details")
 # The rate is multiplied or divided by KL_FACTOR where an update's KL divergence is KL_TOLERANCE times too small or too
 # large: Schulman et al. (2017, section 4) adapt a penalty so; here it is the rate, in smaller and more frequent steps.
 KL_TOLERANCE, KL_FACTOR = 1.5, 1.25
 # A gradient is summed over chunks of whole environments of at most this many pixels (at least one
-# environment). CPU: 64 images of 48 x 27, which measured fastest (cache). Accelerators: about 8 GB
-# of activations, at some 500 bytes a pixel.
-CPU_CHUNK_PIXELS, ACCELERATOR_CHUNK_PIXELS = 64 * 48 * 27, 16 * 2**20
+# environment): some 3 GB of activations on a CPU and 8 on an accelerator, at 500 bytes a pixel.
+CPU_CHUNK_PIXELS, ACCELERATOR_CHUNK_PIXELS = 6 * 2**20, 16 * 2**20
+PIECE_PIXELS = 32 * 48 * 27  # that a core convolves at a time; measured fastest (cache)
 
 
 @struct.dataclass
@@ -79,14 +85,10 @@ def learning_rate_schedule(config: PPOConfig, total_updates: int) -> optax.Sched
 
 
 def default_chunk(network: Network, config: PPOConfig, on_cpu: bool) -> int:
-    """Environments in one piece of a gradient: a divisor of those in a minibatch."""
+    """Environments in one part of a gradient: a divisor of those in a minibatch."""
     per_minibatch = config.num_envs // config.num_minibatches
-    if not network.has_convolutions:
-        return per_minibatch
-    pixels = CPU_CHUNK_PIXELS if on_cpu else ACCELERATOR_CHUNK_PIXELS
-    rows, columns, _ = network.observation_shape
-    most = max(1, pixels // (rows * columns * config.unroll_length))
-    return max(n for n in range(1, per_minibatch + 1) if per_minibatch % n == 0 and n <= most)
+    most = CPU_CHUNK_PIXELS if on_cpu else ACCELERATOR_CHUNK_PIXELS
+    return _largest_divisor(per_minibatch, most // (_pixels(network) * config.unroll_length))
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,7 @@ class Learner:
     optimizer: optax.GradientTransformation
     execution: Literal["host", "fused"]
     chunk: int
+    piece: int  # images that a core convolves at a time, where driven from the host
     draw: Draw | None = None
 
     def init(self, key: Key) -> LearnerState:
@@ -164,16 +167,68 @@ class Learner:
         with ThreadPoolExecutor(num_cores(), "segvisrl-gradient") as pool:
             for epoch in np.asarray(minibatches):
                 for envs in epoch:
-                    gradient_of = functools.partial(self._finished_chunk, progress.state.params, batch)
-                    totals = tuple(pool.map(gradient_of, envs.reshape(-1, self.chunk)))
-                    progress = self._apply(progress, totals)
+                    total_of = functools.partial(self._host_total, pool, progress.state.params, batch)
+                    progress = self._apply(progress, tuple(map(total_of, envs.reshape(-1, self.chunk))))
                 progress = _end_epoch(progress)
                 if self.config.kl_stop > 0 and not self._goes_on(progress):
                     break
         return self._finish(progress, explained_variance)
 
-    def _finished_chunk(self, params: Params, batch: Batch, envs: Int32[np.ndarray, " chunk"]) -> Total:
-        return jax.block_until_ready(self._chunk_total(params, batch, envs))
+    def _host_total(
+        self, pool: ThreadPoolExecutor, params: Params, batch: Batch, envs: Int32[np.ndarray, " chunk"]
+    ) -> Total:
+        """``_chunk_total``, by every core of the pool."""
+        part, pieces = self._cut(batch, envs)
+        maps, pullbacks = zip(*pool.map(functools.partial(self._look, params), pieces), strict=True)
+        gradient, terms, cotangents = self._loss_gradient(params, maps, part)
+        return self._add(gradient, tuple(pool.map(self._pull_back, pullbacks, cotangents))), terms
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def _cut(self, batch: Batch, envs: Int32[Array, " chunk"]) -> tuple[Batch, list[Any]]:
+        """A few environments without their observations, and these as pieces of (n, 1, ...)."""
+        part = take_environments(batch, envs)
+        num_images = self.config.unroll_length * self.chunk
+        num_pieces = num_images // _largest_divisor(num_images, self.piece)
+        leaves, structure = jax.tree.flatten(part.observation)
+        flat = [leaf.reshape((num_images, 1, *leaf.shape[2:])) for leaf in leaves]
+        split = [jnp.split(leaf, num_pieces) for leaf in flat]
+        pieces = [jax.tree.unflatten(structure, few) for few in zip(*split, strict=True)]
+        return dataclasses.replace(part, observation=()), pieces
+
+    def _look(self, params: Params, piece: Any) -> tuple[Float32[Array, "n 1 M"], Pullback]:
+        return jax.block_until_ready(self._look_at(params, piece))
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def _look_at(self, params: Params, piece: Any) -> tuple[Float32[Array, "n 1 M"], Pullback]:
+        """The maps of a piece, and what turns their gradient into that of the parameters."""
+        observation = piece if self.draw is None else self.draw(piece)
+        keep = jax.checkpoint_policies.save_only_these_names(CONVOLVED)
+        maps = jax.checkpoint(lambda params: self.network.maps(params, observation), policy=keep, prevent_cse=False)
+        return jax.vjp(maps, params)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def _loss_gradient(
+        self, params: Params, maps: Sequence[Float32[Array, "n 1 M"]], part: Batch
+    ) -> tuple[Params, LossTerms, list[Float32[Array, "n 1 M"]]]:
+        """The gradient by the parameters behind the maps, the loss terms, the gradient by the maps."""
+        gradient_of = jax.value_and_grad(loss_of_maps, argnums=(0, 1), has_aux=True)
+        whole = jnp.concatenate(maps).reshape((self.config.unroll_length, self.chunk, -1))
+        (_, terms), (gradient, by_maps) = gradient_of(params, whole, part, self.network, self.config)
+        return gradient, terms, jnp.split(by_maps.reshape((-1, 1, by_maps.shape[-1])), len(maps))
+
+    def _pull_back(self, pullback: Pullback, cotangent: Float32[Array, "n 1 M"]) -> Params:
+        return jax.block_until_ready(self._pulled_back(pullback, cotangent))
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def _pulled_back(self, pullback: Pullback, cotangent: Float32[Array, "n 1 M"]) -> Params:
+        return self.network.convolutional(pullback(cotangent)[0])
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def _add(self, gradient: Params, convolutional: Sequence[Params]) -> Params:
+        """The gradient of all parameters."""
+        body = gradient["params"]["body"]
+        total = jax.tree.map(lambda *parts: functools.reduce(jnp.add, parts), *convolutional)
+        return {"params": {**gradient["params"], "body": {**body, **total}}}
 
     @functools.partial(jax.jit, static_argnums=0)
     def _prepare(
@@ -291,7 +346,7 @@ def make_learner(
         config: settings of PPO.
         total_updates: updates of the whole run, over which the learning rate falls.
         execution: host or fused (see the module); auto takes host for convolutions on a CPU.
-        chunk: environments in one piece of a minibatch's gradient; ``default_chunk`` where None.
+        chunk: environments in one part of a minibatch's gradient; ``default_chunk`` where None.
             It changes speed and memory, and the result by rounding only.
         draw: makes the observations of a piece from what the trajectory holds in their place; None where it holds them.
 
@@ -316,12 +371,23 @@ def make_learner(
         optax.clip_by_global_norm(config.max_gradient_norm),
         optax.scale_by_adam(eps=ADAM_EPSILON),
     )
-    return Learner(network, config, schedule, optimizer, kind, chunk, draw)
+    piece = max(1, PIECE_PIXELS // _pixels(network))
+    return Learner(network, config, schedule, optimizer, kind, chunk, piece, draw)
 
 
 def num_cores() -> int:
     """CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _pixels(network: Network) -> int:
+    """Of an observation; 1 where it is no image."""
+    return math.prod(network.observation_shape[:2]) if network.has_convolutions else 1
+
+
+def _largest_divisor(number: int, most: int) -> int:
+    """The largest divisor of ``number`` that is not above ``most``; 1 where none is."""
+    return max(n for n in range(1, number + 1) if number % n == 0 and n <= max(1, most))
 
 
 def _start_progress(state: LearnerState) -> Progress:

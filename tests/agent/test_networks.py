@@ -50,8 +50,12 @@ def resets(seed: int = 1) -> jax.Array:
     return jnp.asarray(drawn, jnp.float32)
 
 
-@pytest.mark.parametrize("size", [(6, 8), (7, 12), (4, 9)], ids=["even", "odd rows", "odd columns"])
-@pytest.mark.parametrize("channels", [(3, 16), (16, 16), (16, 32)], ids=["image", "narrow", "wide"])
+SIZES = {"even": (6, 8), "odd rows": (7, 12), "odd columns": (4, 9), "one image at a time": (54, 97)}
+CHANNELS = {"image": (3, 16), "narrow": (16, 16), "wider": (16, 32), "wide": (32, 32)}
+
+
+@pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
+@pytest.mark.parametrize("channels", CHANNELS.values(), ids=CHANNELS)
 def test_convolution_is_that_of_flax_in_value_and_gradient(size: tuple[int, int], channels: tuple[int, int]) -> None:
     rng = np.random.default_rng(0)
     images = jnp.asarray(rng.normal(size=(2, *size, channels[0])), jnp.float32)

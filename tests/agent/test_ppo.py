@@ -195,10 +195,12 @@ def test_minibatches_cut_environments_and_never_time() -> None:
     np.testing.assert_array_equal(part.carry[1], trajectory.carry[1][envs])
 
 
-def test_both_executions_and_all_chunks_give_the_same_result() -> None:
+def test_both_executions_all_chunks_and_all_pieces_give_the_same_result() -> None:
     state, trajectory = rollout("cnn_lstm")
     variants = [("host", 4), ("host", 1), ("fused", 2)]
-    results = [update(learner_of("cnn_lstm", execution, chunk), state, trajectory) for execution, chunk in variants]
+    learners = [learner_of("cnn_lstm", execution, chunk) for execution, chunk in variants]
+    learners.append(dataclasses.replace(learners[0], piece=4))  # 20 images, by fours
+    results = [update(learner, state, trajectory) for learner in learners]
     for new_state, metrics in results[1:]:
         # Adam's step is rate * sign(gradient) where the gradient is tiny: compare against the rate.
         assert_close(new_state.params, results[0][0].params, atol=0.02 * CONFIG.learning_rate)
@@ -318,10 +320,10 @@ def test_update_compiles_once() -> None:
 @pytest.mark.parametrize(
     ("size", "unroll_length", "on_cpu", "expected"),
     [
-        ((27, 48, 3), 64, True, 1),  # 64 images of 48 x 27
-        ((27, 48, 3), 16, True, 4),
-        ((27, 48, 3), 20, True, 3),  # three environments are 60 images, and divide twelve
-        ((108, 192, 3), 64, True, 1),
+        ((27, 48, 3), 64, True, 12),
+        ((108, 192, 3), 64, True, 4),  # 303 images
+        ((108, 192, 3), 48, True, 6),
+        ((270, 480, 3), 64, True, 1),
         ((27, 48, 3), 64, False, 12),
         ((108, 192, 3), 64, False, 12),
         ((270, 480, 3), 64, False, 2),
