@@ -8,9 +8,10 @@ import functools
 import os
 import statistics
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import jax
 import torch
 from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.callbacks import BaseCallback
@@ -21,9 +22,11 @@ from segvisrl_jax.adapters.stable_baselines3 import LunarRoverVecEnv
 from segvisrl_jax.config import ConfigError, NetworkConfig, TrainConfig, replace_fields
 from segvisrl_jax.env.rover_env import observation_shape
 from segvisrl_jax.machine.speed import learning_row
+from segvisrl_jax.training.loop import Trainer
 
 SCALES = (10.0, 40.0)  # the paper's 192 x 108, and the 48 x 27 of the preset for a CPU
 FEW_ENVS, FEW_MINIBATCHES = 8, 2  # for the gradient alone: the minibatch is that of the preset, 4 environments
+Pass = tuple[Callable[[], None], int]  # something to time, and the images that go through it
 NUM_UPDATES = 3  # of recurrent PPO; the first warms up
 
 
@@ -41,10 +44,10 @@ def peer_rows(preset: TrainConfig, repeats: int, scales: Sequence[float] = SCALE
     torch.set_num_threads(os.cpu_count() or 1)
     for scale in scales:
         few = {"num_envs": FEW_ENVS, "num_minibatches": FEW_MINIBATCHES, "num_epochs": 1}
-        config = replace_fields(preset, scale=scale, **few)
-        ours = learning_row(config, repeats)["gradient_images_per_s"]
+        config = replace_fields(preset, scale=scale, kl_stop=0.0, **few)
+        ours, theirs = _in_turn([_our_gradient(config), _torch_gradient(config)], repeats)
         rows, columns = config.env.camera.observation_size_px
-        yield _row(f"gradient images/s, {columns} x {rows}", ours, "PyTorch", torch_images_per_s(config, repeats))
+        yield _row(f"gradient images/s, {columns} x {rows}", ours, "PyTorch", theirs)
     ours = learning_row(preset, repeats)["decisions_per_s"]
     theirs, renderer = sb3_decisions_per_s(preset)
     yield _row("training decisions/s", ours, f"sb3-contrib RecurrentPPO, renderer {renderer}", theirs)
@@ -87,8 +90,20 @@ class TorchImpala(BaseFeaturesExtractor):
         return torch.relu(self.dense(self.body(images.contiguous(memory_format=torch.channels_last))))
 
 
-def torch_images_per_s(config: TrainConfig, repeats: int) -> float:
-    """Images a second through PyTorch's gradient of the PPO loss and Adam's step, minibatches as in the preset."""
+def _our_gradient(config: TrainConfig) -> Pass:
+    """One epoch of an update."""
+    trainer = Trainer(config)
+    state = trainer.start()
+    _, trajectory, last_value, _ = trainer.act(state)
+
+    def update() -> None:
+        jax.block_until_ready(trainer.learner.update(state.learner, trajectory, last_value, jax.random.key(0)))
+
+    return update, config.ppo.decisions_per_update
+
+
+def _torch_gradient(config: TrainConfig) -> Pass:
+    """PyTorch's gradient of the PPO loss and Adam's step, for a minibatch."""
     import gymnasium
     import numpy as np
 
@@ -120,17 +135,20 @@ def torch_images_per_s(config: TrainConfig, repeats: int) -> float:
         nn.utils.clip_grad_norm_(parameters, ppo.max_gradient_norm)
         optimizer.step()
 
-    return len(images) / _median_seconds(step, repeats)
+    return step, len(images)
 
 
-def _median_seconds(call: Any, repeats: int) -> float:
-    call()  # the first one allocates
-    seconds = []
-    for _ in range(max(repeats, 3)):
-        began = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - began)
-    return statistics.median(seconds)
+def _in_turn(passes: Sequence[Pass], repeats: int) -> list[float]:
+    """Images a second of each, from medians. They take turns, since a shared machine is not equally fast for long."""
+    seconds: list[list[float]] = [[] for _ in passes]
+    for call, _ in passes:
+        call()  # the first one compiles and allocates
+    for _ in range(repeats):
+        for (call, _), taken in zip(passes, seconds, strict=True):
+            began = time.perf_counter()
+            call()
+            taken.append(time.perf_counter() - began)
+    return [num / statistics.median(taken) for (_, num), taken in zip(passes, seconds, strict=True)]
 
 
 class _Clock(BaseCallback):
