@@ -25,7 +25,7 @@ from flax import struct
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float32, Int32
 
-from segvisrl_jax.agent.convolution import CONVOLVED
+from segvisrl_jax.agent.convolution import CONVOLVED, largest_divisor
 from segvisrl_jax.agent.loss import (
     Batch,
     Draw,
@@ -88,7 +88,7 @@ def default_chunk(network: Network, config: PPOConfig, on_cpu: bool) -> int:
     """Environments in one part of a gradient: a divisor of those in a minibatch."""
     per_minibatch = config.num_envs // config.num_minibatches
     most = CPU_CHUNK_PIXELS if on_cpu else ACCELERATOR_CHUNK_PIXELS
-    return _largest_divisor(per_minibatch, most // (_pixels(network) * config.unroll_length))
+    return largest_divisor(per_minibatch, most // (_pixels(network) * config.unroll_length))
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ class Learner:
         """A few environments without their observations, and these as pieces of (n, 1, ...)."""
         part = take_environments(batch, envs)
         num_images = self.config.unroll_length * self.chunk
-        num_pieces = num_images // _largest_divisor(num_images, self.piece)
+        num_pieces = num_images // largest_divisor(num_images, self.piece)
         leaves, structure = jax.tree.flatten(part.observation)
         flat = [leaf.reshape((num_images, 1, *leaf.shape[2:])) for leaf in leaves]
         split = [jnp.split(leaf, num_pieces) for leaf in flat]
@@ -383,11 +383,6 @@ def num_cores() -> int:
 def _pixels(network: Network) -> int:
     """Of an observation; 1 where it is no image."""
     return math.prod(network.observation_shape[:2]) if network.has_convolutions else 1
-
-
-def _largest_divisor(number: int, most: int) -> int:
-    """The largest divisor of ``number`` that is not above ``most``; 1 where none is."""
-    return max(n for n in range(1, number + 1) if number % n == 0 and n <= max(1, most))
 
 
 def _start_progress(state: LearnerState) -> Progress:
