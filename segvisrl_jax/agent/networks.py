@@ -69,7 +69,27 @@ class ResidualBlock(nn.Module):
         return images + _convolution(self.channels, RESIDUAL_GAIN)(nn.relu(change))
 
 
-class ImpalaCNN(nn.Module):
+class Body(nn.Module):
+    """Observation to features: what subclasses do in ``__call__``.
+
+    Where most of the work is in its convolutions, and most parameters behind them, a body says so by
+    ``maps`` and ``summary``, of which ``__call__`` is then made: a CPU does the former a few images at a time.
+    """
+
+    def __call__(self, observation: Shaped[Array, "..."]) -> Float32[Array, "*B F"]:
+        """Features of every observation; any leading axes."""
+        return self.summary(self.maps(observation))
+
+    def maps(self, observation: Shaped[Array, "..."]) -> Float32[Array, "*B M"]:
+        """What the convolutions make of every observation; here, the features."""
+        return self(observation)
+
+    def summary(self, maps: Float32[Array, "*B M"]) -> Float32[Array, "*B F"]:
+        """Features from ``maps``."""
+        return maps
+
+
+class ImpalaCNN(Body):
     """Image to feature vector (Espeholt et al., 2018, the large network)."""
 
     channels: tuple[int, ...]
@@ -85,12 +105,8 @@ class ImpalaCNN(nn.Module):
                 setattr(self, f"ResidualBlock_{stage * len(blocks) + block}", ResidualBlock(channels))
         self.Dense_0 = _dense(self.feature_size)
 
-    def __call__(self, images: UInt8[Array, "*B H W C"]) -> Float32[Array, "*B F"]:
-        """Features of every image; the leading axes are flattened for the convolutions."""
-        return self.summary(self.maps(images))
-
     def maps(self, images: UInt8[Array, "*B H W C"]) -> Float32[Array, "*B M"]:
-        """What the convolutions make of every image."""
+        """What the convolutions make of every image; the leading axes are flattened for them."""
         batch_shape = images.shape[:-3]
         maps = images.reshape((-1, *images.shape[-3:])).astype(jnp.float32) / PIXEL_MAX
         for stage in range(len(self.channels)):
@@ -104,21 +120,13 @@ class ImpalaCNN(nn.Module):
         return nn.relu(self.Dense_0(maps))
 
 
-class MLP(nn.Module):
+class MLP(Body):
     """Dense layers with relu over a state vector."""
 
     sizes: tuple[int, ...]
 
-    def __call__(self, vector: Float32[Array, "*B D"]) -> Float32[Array, "*B F"]:
-        """Features of every vector."""
-        return self.summary(self.maps(vector))
-
-    def maps(self, vector: Float32[Array, "*B D"]) -> Float32[Array, "*B D"]:
-        """The vector: there is nothing to convolve."""
-        return vector
-
     @nn.compact
-    def summary(self, vector: Float32[Array, "*B D"]) -> Float32[Array, "*B F"]:
+    def __call__(self, vector: Float32[Array, "*B D"]) -> Float32[Array, "*B F"]:
         """Features of every vector."""
         for size in self.sizes:
             vector = nn.relu(_dense(size)(vector))
@@ -158,7 +166,7 @@ class ActorCritic(nn.Module):
         return self.unroll_maps(carry, self.maps(observation), reset)
 
     def maps(self, observation: Shaped[Array, "..."]) -> Float32[Array, "*B M"]:
-        """What the convolutions make of observations; the observations themselves where there are none."""
+        """``Body.maps``."""
         return self.body.maps(observation)
 
     def unroll_maps(
@@ -234,8 +242,14 @@ class Network:
 
     def convolutional(self, params: Params) -> Params:
         """The part of the parameters, or of a gradient, that ``maps`` reads: {layer's name: its leaves}."""
-        layers = params["params"]["body"].items()
-        return {name: leaves for name, leaves in layers if not name.startswith("Dense")}
+        return {name: params["params"]["body"][name] for name in self._convolutional_layers}
+
+    @functools.cached_property
+    def _convolutional_layers(self) -> tuple[str, ...]:
+        """Names of the body's layers that ``maps`` would initialise."""
+        observation = jax.ShapeDtypeStruct((1, *self.observation_shape), self.observation_dtype)
+        init = functools.partial(self.module.init, method="maps")
+        return tuple(jax.eval_shape(init, jax.random.key(0), observation)["params"].get("body", ()))
 
     def initial_carry(self, batch_shape: tuple[int, ...]) -> Carry:
         """``ActorCritic.initial_carry``."""
@@ -271,7 +285,7 @@ def make_network(arch: str, config: NetworkConfig, observation_shape: tuple[int,
     return Network(ActorCritic(cast(Arch, arch), config), tuple(observation_shape))
 
 
-def _make_body(arch: Arch, config: NetworkConfig) -> MLP | ImpalaCNN:
+def _make_body(arch: Arch, config: NetworkConfig) -> Body:
     if has_convolutions(arch):
         return ImpalaCNN(config.channels, config.blocks_per_stage, config.feature_size)
     return MLP(config.mlp_sizes)

@@ -195,10 +195,11 @@ def test_minibatches_cut_environments_and_never_time() -> None:
     np.testing.assert_array_equal(part.carry[1], trajectory.carry[1][envs])
 
 
-def test_both_executions_all_chunks_and_all_pieces_give_the_same_result() -> None:
-    state, trajectory = rollout("cnn_lstm")
+@pytest.mark.parametrize("arch", ["cnn_lstm", "mlp"])  # a body in two parts; in one
+def test_both_executions_all_chunks_and_all_pieces_give_the_same_result(arch: str) -> None:
+    state, trajectory = rollout(arch)
     variants = [("host", 4), ("host", 1), ("fused", 2)]
-    learners = [learner_of("cnn_lstm", execution, chunk) for execution, chunk in variants]
+    learners = [learner_of(arch, execution, chunk) for execution, chunk in variants]
     learners.append(dataclasses.replace(learners[0], piece=4))  # 20 images, by fours
     results = [update(learner, state, trajectory) for learner in learners]
     for new_state, metrics in results[1:]:
@@ -206,7 +207,7 @@ def test_both_executions_all_chunks_and_all_pieces_give_the_same_result() -> Non
         assert_close(new_state.params, results[0][0].params, atol=0.02 * CONFIG.learning_rate)
         assert_close(metrics, results[0][1], rtol=1e-3, atol=1e-5)
     pairs = zip(leaves(results[0][0].params), leaves(state.params), strict=True)
-    assert min(np.abs(after - before).max() for after, before in pairs) > CONFIG.learning_rate
+    assert min(np.abs(after - before).max() for after, before in pairs) > CONFIG.learning_rate / 2
 
 
 @pytest.mark.parametrize(("execution", "chunk"), [("host", 4), ("fused", 2)])
