@@ -97,7 +97,7 @@ docs-serve: $(EXTRAS_READY) ## show the documentation site on http://127.0.0.1:8
 notebooks: $(EXTRAS_READY) ## run NOTEBOOKS of experiments/ and write them with their outputs: notebooks/*.ipynb
 	@mkdir -p notebooks
 	@for name in $(NOTEBOOKS); do \
-	  $(BIN)/jupytext --quiet --to ipynb --execute --run-path . --output notebooks/$$name.ipynb experiments/$$name.py && \
+	  $(BIN)/jupytext --quiet --to ipynb --set-kernel python3 --execute --run-path . --output notebooks/$$name.ipynb experiments/$$name.py && \
 	  echo notebooks/$$name.ipynb || exit 1; done
 
 RESOLVE := uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate --no-header

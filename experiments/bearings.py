@@ -3,7 +3,7 @@
 # Success, and the shortest path over the driven one, over the direction of the goal at the start, from what
 # `segvisrl eval ... --json EVAL.json` measured. The camera sees 35 degrees to each side.
 #
-# `python experiments/bearings.py [EVAL.json ...] [--output F.png]`, by default docs/images/bearings.png.
+# `python experiments/bearings.py [EVAL.json ...] [--output F.png]`, by default figures/bearings.png.
 # Takes some seconds.
 
 # %%
@@ -28,7 +28,7 @@ class BearingOptions:
 
     evaluations: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="EVAL.json ...")] = ()
     """Files that segvisrl eval --json wrote."""
-    output: Path = Path("docs/images/bearings.png")
+    output: Path = Path("figures/bearings.png")
     """The picture."""
 
     def __post_init__(self) -> None:

@@ -9,7 +9,7 @@
 # frame: "lit part" leaves it out. And `scanline` gives the ground a relief that MuJoCo's plain plane does not have: no
 # setting turns it off, so the frames are drawn once more with `shading.RELIEF` emptied here.
 #
-# `python experiments/colour_agreement.py [FRAMES] [OUTPUT_FOLDER]`, by default 12 and docs/images; needs OpenGL. 12
+# `python experiments/colour_agreement.py [FRAMES] [OUTPUT_FOLDER]`, by default 12 and figures; needs OpenGL. 12
 # frames take about half a minute. Writes colour_agreement.png.
 
 # %%
@@ -31,7 +31,7 @@ from segvisrl_jax.vision.renderer import make_renderer
 
 IS_SCRIPT = "__file__" in globals()
 FRAMES = int(sys.argv[1]) if IS_SCRIPT and len(sys.argv) > 1 else 12
-OUTPUT = Path(sys.argv[2]) if IS_SCRIPT and len(sys.argv) > 2 else Path("docs/images")
+OUTPUT = Path(sys.argv[2]) if IS_SCRIPT and len(sys.argv) > 2 else Path("figures")
 OUTPUT.mkdir(parents=True, exist_ok=True)
 HEIGHT, WIDTH, SCALE = 1080, 1920, 10
 KEPT_CLEAR_M = 0.8  # every rock's middle from the rover's: no collision, and no rock that fills the image

@@ -4,7 +4,7 @@
 # settings: over scene.num_rocks the density curve, over camera.scale the scale curve. One line for each method, with
 # its Wilson 95 % intervals as a band; the planner, where it is among them, as a dashed ceiling.
 #
-# `python experiments/curves.py [EVAL.json ...] --x FIELD [--output F.png]`, by default docs/images/curve_FIELD.png.
+# `python experiments/curves.py [EVAL.json ...] --x FIELD [--output F.png]`, by default figures/curve_FIELD.png.
 # Takes some seconds. For example
 #
 #     for n in 0 4 8 16 32 64; do for c in p planner; do
@@ -36,7 +36,7 @@ class CurvesOptions:
     x: str = "scene.num_rocks"
     """The setting: a number in the environment's settings, in full (camera.scale) or its last part (scale)."""
     output: Path | None = None
-    """The picture; by default docs/images/curve_FIELD.png."""
+    """The picture; by default figures/curve_FIELD.png."""
 
     def __post_init__(self) -> None:
         is_picture = self.output is None or self.output.suffix == ".png"
@@ -55,7 +55,7 @@ def work(asked: CurvesOptions) -> None:
             shares = " | ".join(share(median, kind) for kind in ("success", "collision"))
             print(f"| {line.name} | {value:g} | {median.episodes:,} | {len(seeds)} | {shares} |")
     name = field.rpartition(".")[2]
-    show(draw_success_curves(evaluations, field, asked.output or Path(f"docs/images/curve_{name}.png")))
+    show(draw_success_curves(evaluations, field, asked.output or Path(f"figures/curve_{name}.png")))
 
 
 def share(evaluation: Evaluation, kind: str) -> str:

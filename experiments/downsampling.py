@@ -4,7 +4,7 @@
 # growing distances ahead, at some places across the view. For every scale: in what share of the places is at least
 # one pixel of the shrunk image still nearer to the object's colour than to any other?
 #
-# `python experiments/downsampling.py [PLACES] [OUTPUT_FOLDER]`, by default 24 and docs/images; needs no OpenGL. 24
+# `python experiments/downsampling.py [PLACES] [OUTPUT_FOLDER]`, by default 24 and figures; needs no OpenGL. 24
 # places take about a minute on two cores. Writes downsampling.png.
 
 # %%
@@ -22,7 +22,7 @@ from segvisrl_jax.vision.classes import PALETTE, SegmentationClass
 
 IS_SCRIPT = "__file__" in globals()
 PLACES = int(sys.argv[1]) if IS_SCRIPT and len(sys.argv) > 1 else 24
-OUTPUT = Path(sys.argv[2]) if IS_SCRIPT and len(sys.argv) > 2 else Path("docs/images")
+OUTPUT = Path(sys.argv[2]) if IS_SCRIPT and len(sys.argv) > 2 else Path("figures")
 OUTPUT.mkdir(parents=True, exist_ok=True)
 SCALES = (2, 5, 10, 20, 30, 40, 60, 90, 120)
 DISTANCES_M = np.array([1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 13.0, 16.0, 19.0])

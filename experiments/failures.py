@@ -4,7 +4,7 @@
 # map with the trail and, at the last decision, the camera's image and what the policy saw in it.
 #
 # `python experiments/failures.py [POLICY ...] [--episodes N] [--output F.png]`, by default cnn_lstm on 200 scenes, and
-# docs/images/failures.png. Writes failures.png; of several policies a page each, failures_NAME.png. 200 scenes take
+# figures/failures.png. Writes failures.png; of several policies a page each, failures_NAME.png. 200 scenes take
 # about three minutes for a policy at scale 40 on two cores.
 
 # %%
@@ -42,7 +42,7 @@ class FailuresOptions:
     """Names the test scenes, as for segvisrl eval."""
     most: int = 8
     """Failures on a page."""
-    output: Path = Path("docs/images/failures.png")
+    output: Path = Path("figures/failures.png")
     """The picture; of several policies, each one's name is added to it."""
 
     def __post_init__(self) -> None:

@@ -3,7 +3,7 @@
 # Return of training episodes and success on held-out scenes over training decisions: one colour for each architecture,
 # the median over its seeds as a line and a band from the worst to the best seed. Runs may still be going on.
 #
-# `python experiments/learning_curves.py [RUN ...] [--output F.png]`, by default docs/images/learning_curves.png. Writes
+# `python experiments/learning_curves.py [RUN ...] [--output F.png]`, by default figures/learning_curves.png. Writes
 # learning_curves.png and, beside it, learning_curves.csv with what is drawn: given in place of the runs' folders it
 # gives the same picture again. Takes some seconds.
 
@@ -28,7 +28,7 @@ class LearningCurvesOptions:
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(name="RUN", metavar="RUN ...")] = ()
     """Folders that segvisrl train made, and .csv files that this script wrote."""
-    output: Path = Path("docs/images/learning_curves.png")
+    output: Path = Path("figures/learning_curves.png")
     """The picture; its numbers go beside it, in a .csv of the same name."""
 
     def __post_init__(self) -> None:

@@ -4,7 +4,7 @@
 # preprocessing (paper, figure 3): raw image, segmentation, what the policy gets, and what is left where the image is
 # shrunk too far.
 #
-# `python experiments/pictures.py [OUTPUT_FOLDER]`, by default docs/images; needs OpenGL. It takes about 20 seconds.
+# `python experiments/pictures.py [OUTPUT_FOLDER]`, by default figures; needs OpenGL. It takes about 20 seconds.
 # Writes rover.png and preprocessing.png.
 
 # %%
@@ -27,7 +27,7 @@ from segvisrl_jax.vision.gl_context import open_draw_context
 from segvisrl_jax.vision.renderer import make_renderer
 
 IS_SCRIPT = "__file__" in globals()
-OUTPUT = Path(sys.argv[1]) if IS_SCRIPT and len(sys.argv) > 1 else Path("docs/images")
+OUTPUT = Path(sys.argv[1]) if IS_SCRIPT and len(sys.argv) > 1 else Path("figures")
 OUTPUT.mkdir(parents=True, exist_ok=True)
 SCALES = {"Scale 10 (paper)": 10, "Scale 40 (cpu preset)": 40, "Scale 80": 80, "Scale 120, too far": 120}
 

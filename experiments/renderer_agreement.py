@@ -3,7 +3,7 @@
 # Draws frames at 1920 x 1080 with `scanline` and with MuJoCo's own renderer, counts the pixels whose class differs, and
 # compares what the policy would get at scale 10. Half of the frames are from driving, the others are hard to draw.
 #
-# `python experiments/renderer_agreement.py [FRAMES] [OUTPUT_FOLDER]`, by default 60 and docs/images; needs OpenGL. 60
+# `python experiments/renderer_agreement.py [FRAMES] [OUTPUT_FOLDER]`, by default 60 and figures; needs OpenGL. 60
 # frames take about a minute. Writes renderer_agreement.png.
 
 # %%
@@ -23,7 +23,7 @@ from segvisrl_jax.vision.renderer import make_renderer
 
 IS_SCRIPT = "__file__" in globals()
 FRAMES = int(sys.argv[1]) if IS_SCRIPT and len(sys.argv) > 1 else 60
-OUTPUT = Path(sys.argv[2]) if IS_SCRIPT and len(sys.argv) > 2 else Path("docs/images")
+OUTPUT = Path(sys.argv[2]) if IS_SCRIPT and len(sys.argv) > 2 else Path("figures")
 OUTPUT.mkdir(parents=True, exist_ok=True)
 HEIGHT, WIDTH, SCALE, FAR_M = 1080, 1920, 10, 20.0
 

@@ -6,7 +6,7 @@
 # counts as a collision, the goal with the circle that counts as arrival, a line for each method with how it ended.
 #
 # `python experiments/trajectories.py [METHOD ...] [--episodes N] [--output F.png]`, by default cnn_lstm, p and planner
-# on 60 scenes, and docs/images/trajectories.png. Writes trajectories.png. 60 scenes take about a minute for a policy
+# on 60 scenes, and figures/trajectories.png. Writes trajectories.png. 60 scenes take about a minute for a policy
 # at scale 40 on two cores.
 
 # %%
@@ -50,7 +50,7 @@ class TrajectoriesOptions:
     """Rocks on the map; default: as the first policy was trained with."""
     seed: int = 0
     """Names the test scenes, as for segvisrl eval."""
-    output: Path = Path("docs/images/trajectories.png")
+    output: Path = Path("figures/trajectories.png")
 
     def __post_init__(self) -> None:
         require(len(self.methods) > 0, "METHOD", "none given", "at least one policy or controller")

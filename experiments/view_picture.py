@@ -2,7 +2,7 @@
 # # The viewer's page
 # Opens `segvisrl view` in Chromium without a window, lets `cnn_lstm` drive for some seconds, and takes a picture.
 #
-# `python experiments/view_picture.py [OUTPUT_FOLDER]`, by default docs/images; needs the extra `view`, selenium, and
+# `python experiments/view_picture.py [OUTPUT_FOLDER]`, by default figures; needs the extra `view`, selenium, and
 # Chromium with chromedriver. It takes about a minute. Writes view.png.
 
 # %%
@@ -21,7 +21,7 @@ from segvisrl_jax.commands.view import ViewOptions, open_viewer
 from segvisrl_jax.view.stage import rock_name
 
 IS_SCRIPT = "__file__" in globals()
-OUTPUT = Path(sys.argv[1]) if IS_SCRIPT and len(sys.argv) > 1 else Path("docs/images")
+OUTPUT = Path(sys.argv[1]) if IS_SCRIPT and len(sys.argv) > 1 else Path("figures")
 OUTPUT.mkdir(parents=True, exist_ok=True)
 SCENE, NUM_ROCKS, DRIVEN_S = 5, 24, 34
 WINDOW_PX = (1480, 1000)

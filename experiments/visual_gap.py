@@ -6,7 +6,7 @@
 # the Moon, and leaves it open.
 #
 # `python experiments/visual_gap.py [POLICY ...] [--episodes N] [--kinds KIND ...] [--output F.png]`, by default
-# cnn_lstm, 200 episodes, every kind, and docs/images/visual_gap.png. Writes visual_gap.png; beside it what every shift
+# cnn_lstm, 200 episodes, every kind, and figures/visual_gap.png. Writes visual_gap.png; beside it what every shift
 # looks like at its worst (visual_gap_views.png) and all numbers (visual_gap.json). What is in the JSON already is not
 # driven again: stopped, it goes on where it was. 200 episodes at one severity take one to three minutes on two cores at
 # scale 40; there are 54 severities for a policy that sees segmented images, and 72 for one that sees colour
@@ -137,7 +137,7 @@ class VisualGapOptions:
     """At most so many of each, those furthest from training; default: all."""
     seed: int = 0
     """Names the test scenes, as for segvisrl eval."""
-    output: Path = Path("docs/images/visual_gap.png")
+    output: Path = Path("figures/visual_gap.png")
     """The figure; numbers and views are written beside it."""
 
     def __post_init__(self) -> None:

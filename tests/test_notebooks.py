@@ -1,6 +1,9 @@
 """The scripts in experiments/ are notebooks too: the quickstart runs in a Jupyter kernel, far from this folder."""
 
 import re
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -85,3 +88,22 @@ def test_a_mistake_in_a_notebook_is_raised(tmp_path):
     notebook.cells[-1].source = "run_script(BearingOptions, work, parse)"
     with pytest.raises(nbclient.exceptions.CellExecutionError, match="none given"):
         executed(notebook, ROOT)
+
+
+@pytest.mark.slow
+def test_make_writes_them_with_their_outputs(tmp_path):
+    jupytext = pytest.importorskip("jupytext")
+    venv = Path(sys.prefix)
+    if not (venv / ".extras-ready").exists():
+        pytest.skip("`make extras` has not been run here")
+    locks = ("requirements.lock", "requirements-extras.lock", "pyproject.toml")
+    for name in ("Makefile", *locks):
+        shutil.copy2(ROOT / name, tmp_path)
+    for name in ("experiments", "docs/results"):
+        shutil.copytree(ROOT / name, tmp_path / name)
+    as_they_are = [word for name in locks for word in ("--assume-old", name)]
+    command = ["make", "notebooks", "NOTEBOOKS=bearings", f"VENV={venv}", *as_they_are]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "image/png" in shown(jupytext.read(tmp_path / "notebooks" / "bearings.ipynb"))
+    assert (tmp_path / "figures" / "bearings.png").exists()

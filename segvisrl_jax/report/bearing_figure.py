@@ -76,7 +76,7 @@ def draw_bearings(evaluations: Sequence[Evaluation], path_png: Path) -> Path:
             axes.plot(line.bearing_deg, getattr(line, part), "-o", color=colour, lw=1.6, ms=4, mec="white", mew=0.5)
         axes.set_title(title, loc="left", fontsize=11)
         axes.set_xlabel("direction of the goal at the start [°], left above 0; shaded: in view")
-        axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0))
         axes.xaxis.set_inverted(True)  # left is left
         clear_frame(axes)
     ends = [_end(line, colour, panels[1].get_ylim()[0]) for line, colour in zip(lines, colours, strict=True)]
