@@ -99,4 +99,4 @@ def scene_has_rocks(episode) -> bool:
 
 
 # %%
-run_script(FailuresOptions, work, parse)
+run_script(FailuresOptions, work, parse, in_notebook="cnn_lstm --num-rocks 32")

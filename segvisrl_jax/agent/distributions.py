@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float32, PRNGKeyArray, UInt32
 
+from segvisrl_jax.agent.shard import WHOLE, Shard
+
 LOG_TWO_PI = math.log(2 * math.pi)
 
 
@@ -20,9 +22,10 @@ class DiagonalGaussian:
     mean: Float32[Array, "*B A"]
     log_std: Float32[Array, " A"]  # the same in every state
 
-    def sample(self, *, key: PRNGKeyArray | UInt32[Array, "2"]) -> Float32[Array, "*B A"]:
-        """One action for each batch element."""
-        noise = jax.random.normal(key, self.mean.shape, self.mean.dtype)
+    def sample(self, *, key: PRNGKeyArray | UInt32[Array, "2"], shard: Shard = WHOLE) -> Float32[Array, "*B A"]:
+        """One action for each batch element, of those that are a ``shard`` of all."""
+        rows, *rest = self.mean.shape
+        noise = shard.of(jax.random.normal(key, (shard.count * rows, *rest), self.mean.dtype))
         return self.mean + self._spread_over_batch(jnp.exp(self.log_std)) * noise
 
     def mode(self) -> Float32[Array, "*B A"]:

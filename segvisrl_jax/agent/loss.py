@@ -15,6 +15,7 @@ from jaxtyping import Array, Float32, Int32, Shaped
 from segvisrl_jax.agent.distributions import DiagonalGaussian
 from segvisrl_jax.agent.gae import generalized_advantages
 from segvisrl_jax.agent.networks import Carry, Network, Params
+from segvisrl_jax.agent.shard import WHOLE, Shard
 from segvisrl_jax.config import PPOConfig
 
 TINY = 1e-8  # keeps a division by a standard deviation or a variance finite
@@ -111,7 +112,7 @@ def loss_of_maps(
 
 
 def make_batch(
-    trajectory: Trajectory, last_value: Float32[Array, " B"], config: PPOConfig
+    trajectory: Trajectory, last_value: Float32[Array, " B"], config: PPOConfig, shard: Shard = WHOLE
 ) -> tuple[Batch, Float32[Array, ""]]:
     """A trajectory with its advantages and value targets, and the targets' explained variance.
 
@@ -119,6 +120,7 @@ def make_batch(
         trajectory: the rollout.
         last_value: value of the observation after its last step.
         config: discount, GAE and whether a time limit counts as an end.
+        shard: which part of the environments these are.
     """
     bootstrapped = trajectory.truncation_value if config.bootstrap_on_timeout else 0.0
     advantage, value_target = generalized_advantages(
@@ -131,9 +133,10 @@ def make_batch(
         config.discount,
         config.gae_lambda,
     )
-    unexplained = jnp.var(advantage) / (jnp.var(value_target) + TINY)
+    mean, variance = shard.moments(advantage)
+    unexplained = variance / (shard.moments(value_target)[1] + TINY)
     if config.normalize_advantage:
-        advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + TINY)
+        advantage = (advantage - mean) / (jnp.sqrt(variance) + TINY)
     batch = Batch(
         observation=trajectory.observation,
         action=trajectory.action,

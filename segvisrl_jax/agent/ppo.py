@@ -37,6 +37,7 @@ from segvisrl_jax.agent.loss import (
     take_environments,
 )
 from segvisrl_jax.agent.networks import Key, Network, Params
+from segvisrl_jax.agent.shard import WHOLE, Shard
 from segvisrl_jax.config import PPOConfig, require
 
 Execution = Literal["auto", "host", "fused"]
@@ -84,11 +85,10 @@ def learning_rate_schedule(config: PPOConfig, total_updates: int) -> optax.Sched
     return optax.linear_schedule(config.learning_rate, final, max(1, total_updates - 1))
 
 
-def default_chunk(network: Network, config: PPOConfig, on_cpu: bool) -> int:
+def default_chunk(network: Network, config: PPOConfig, on_cpu: bool, shard: Shard = WHOLE) -> int:
     """Environments in one part of a gradient: a divisor of those in a minibatch."""
-    per_minibatch = config.num_envs // config.num_minibatches
     most = CPU_CHUNK_PIXELS if on_cpu else ACCELERATOR_CHUNK_PIXELS
-    return largest_divisor(per_minibatch, most // (_pixels(network) * config.unroll_length))
+    return largest_divisor(_per_minibatch(config, shard), most // (_pixels(network) * config.unroll_length))
 
 
 @dataclass(frozen=True)
@@ -106,6 +106,7 @@ class Learner:
     chunk: int
     piece: int  # images that a core convolves at a time, where driven from the host
     draw: Draw | None = None
+    shard: Shard = WHOLE  # of the environments, inside jax.shard_map
 
     def init(self, key: Key) -> LearnerState:
         """Fresh parameters and optimiser state."""
@@ -127,7 +128,7 @@ class Learner:
 
         Args:
             state: where learning stands; not changed.
-            trajectory: (T, B) = (unroll_length, num_envs) decisions.
+            trajectory: (T, B) = (unroll_length, num_envs) decisions; a shard's part of them inside jax.shard_map.
             last_value: value of the observation after the last decision.
             key: for cutting the minibatches.
 
@@ -138,7 +139,7 @@ class Learner:
         Raises:
             ValueError: for a trajectory of another size.
         """
-        expected = (self.config.unroll_length, self.config.num_envs)
+        expected = (self.config.unroll_length, self.config.num_envs // self.shard.count)
         if trajectory.reward.shape != expected:
             raise ValueError(f"trajectory is {trajectory.reward.shape}, the config says {expected}")
         if self.execution == "fused":
@@ -235,12 +236,18 @@ class Learner:
         self, trajectory: Trajectory, last_value: Array, key: Key
     ) -> tuple[Batch, Int32[Array, "E M N"], Float32[Array, ""]]:
         """The batch, the environments of each minibatch of each epoch, the explained variance."""
-        batch, explained_variance = make_batch(trajectory, last_value, self.config)
-        num_envs, num_epochs = self.config.num_envs, self.config.num_epochs
-        keys = jax.random.split(key, num_epochs)
-        order = jax.vmap(lambda epoch_key: jax.random.permutation(epoch_key, num_envs))(keys)
-        minibatches = order.reshape((num_epochs, self.config.num_minibatches, -1))
-        return batch, minibatches.astype(jnp.int32), explained_variance
+        batch, explained_variance = make_batch(trajectory, last_value, self.config, self.shard)
+        keys = jax.random.split(key, self.config.num_epochs)
+        return batch, jax.vmap(self._cut_minibatches)(keys), explained_variance
+
+    def _cut_minibatches(self, key: Key) -> Int32[Array, "M N"]:
+        """The environments of each minibatch: of any M neighbours it has one. So every shard has as many in it."""
+        num_minibatches = self.config.num_minibatches
+        keys = jax.random.split(key, self.config.num_envs // num_minibatches)
+        order = jax.vmap(lambda row_key: jax.random.permutation(row_key, num_minibatches))(keys)
+        mine = self.shard.of(order)
+        first = num_minibatches * jnp.arange(len(mine))
+        return (first[:, None] + mine).T.astype(jnp.int32)
 
     def _minibatch_step(self, batch: Batch, progress: Progress, envs: Int32[Array, " N"]) -> tuple[Progress, None]:
         params = progress.state.params
@@ -264,8 +271,8 @@ class Learner:
     def _apply(self, progress: Progress, totals: tuple[Total, ...]) -> Progress:
         """One step of the optimiser with the mean over a minibatch's chunks, if it is finite."""
         total = jax.tree.map(lambda *parts: functools.reduce(jnp.add, parts), *totals)
-        num_chunks = self.config.num_envs // self.config.num_minibatches // self.chunk
-        gradient, terms = jax.tree.map(lambda leaf: leaf / num_chunks, total)
+        num_chunks = _per_minibatch(self.config, self.shard) // self.chunk
+        gradient, terms = self.shard.mean(jax.tree.map(lambda leaf: leaf / num_chunks, total))
         state = progress.state
         norm = optax.tree.norm(gradient)
         with jax.numpy_dtype_promotion("standard"):  # optax multiplies whole numbers by floats
@@ -338,6 +345,7 @@ def make_learner(
     execution: str = "auto",
     chunk: int | None = None,
     draw: Draw | None = None,
+    shard: Shard = WHOLE,
 ) -> Learner:
     """The learner of a network.
 
@@ -345,10 +353,11 @@ def make_learner(
         network: from ``make_network``.
         config: settings of PPO.
         total_updates: updates of the whole run, over which the learning rate falls.
-        execution: host or fused (see the module); auto takes host for convolutions on a CPU.
+        execution: host or fused (see the module); auto takes host for convolutions on a CPU, unless these are a shard.
         chunk: environments in one part of a minibatch's gradient; ``default_chunk`` where None.
             It changes speed and memory, and the result by rounding only.
         draw: makes the observations of a piece from what the trajectory holds in their place; None where it holds them.
+        shard: which part of the environments the learner sees, inside ``jax.shard_map``; fused only.
 
     Raises:
         ConfigError: for settings out of range.
@@ -356,15 +365,16 @@ def make_learner(
     options = Execution.__args__  # type: ignore[attr-defined]
     require(execution in options, "execution", execution, "one of " + ", ".join(options))
     require(total_updates >= 1, "total_updates", total_updates, "at least 1")
-    per_minibatch = config.num_envs // config.num_minibatches
     on_cpu = jax.default_backend() == "cpu"
+    per_minibatch = _per_minibatch(config, shard)
     if chunk is None:
-        chunk = default_chunk(network, config, on_cpu)
+        chunk = default_chunk(network, config, on_cpu, shard)
     divides = 1 <= chunk <= per_minibatch and per_minibatch % chunk == 0
     should = f"a divisor of the {per_minibatch} environments in a minibatch"
     require(divides, "chunk", chunk, should)
     if execution == "auto":
-        execution = "host" if on_cpu and network.has_convolutions else "fused"
+        execution = "host" if on_cpu and network.has_convolutions and shard == WHOLE else "fused"
+    require(execution == "fused" or shard == WHOLE, "execution", execution, "fused for several devices")
     kind = cast(Literal["host", "fused"], execution)
     schedule = learning_rate_schedule(config, total_updates)
     optimizer = optax.chain(
@@ -372,12 +382,17 @@ def make_learner(
         optax.scale_by_adam(eps=ADAM_EPSILON),
     )
     piece = max(1, PIECE_PIXELS // _pixels(network))
-    return Learner(network, config, schedule, optimizer, kind, chunk, piece, draw)
+    return Learner(network, config, schedule, optimizer, kind, chunk, piece, draw, shard)
 
 
 def num_cores() -> int:
     """CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _per_minibatch(config: PPOConfig, shard: Shard) -> int:
+    """Environments of a minibatch that a shard has."""
+    return config.num_envs // config.num_minibatches // shard.count
 
 
 def _pixels(network: Network) -> int:

@@ -15,6 +15,7 @@ from segvisrl_jax.config import (
     flatten,
     from_dict,
     preset_config,
+    require,
     to_dict,
 )
 
@@ -27,10 +28,13 @@ def run(options: Sequence[str]) -> int:
 
     from segvisrl_jax.training.loop import train
 
-    if not config.resume:
+    is_first = config.process_id == 0
+    if not config.resume and is_first:
         print(differences_from_paper(config))
         print(observation_memory(config))
     result = train(config)
+    if not is_first:
+        return 0 if result.finished else INTERRUPTED
     resume = f"segvisrl train --resume --runs-dir {config.runs_dir} --run {config.run_name}"
     if not result.finished:
         print(f"Stopped and saved after {result.decisions:,} decisions. Go on with:\n  {resume}")
@@ -48,6 +52,8 @@ def parse_config(options: Sequence[str]) -> TrainConfig:
         if base is not None:
             return parse(TrainConfig, words, "train", base)
     if preset == "auto":
+        should = "named where processes train together, e.g. gpu"
+        require("--coordinator" not in words, "preset", "auto", should)  # JAX is not to be asked before they have met
         preset = preset_for_this_machine()
         words = _without(words, "--preset")
     return parse(TrainConfig, words, "train", preset_config(arch, preset))
@@ -94,7 +100,10 @@ def differences_from_paper(config: TrainConfig) -> str:
     """One block: what of these settings is not the paper's."""
     paper = flatten(to_dict(preset_config(config.arch, "paper")))
     ours = flatten(to_dict(config))
-    bookkeeping = ("seed", "run", "runs_dir", "resume", "preset", "checkpoint_every_updates", "loggers")
+    bookkeeping = (
+        "seed", "run", "runs_dir", "resume", "preset", "checkpoint_every_updates", "loggers",
+        "num_devices", "coordinator", "num_processes", "process_id",
+    )  # fmt: skip
     rows = [
         f"  {name:<34} {_short(value):>12}   paper {_short(paper[name])}"
         for name, value in ours.items()

@@ -155,6 +155,14 @@ class TrainConfig:
     """Go on from the run folder's last checkpoint."""
     start_from: str = ""
     """A policy's folder, or a shipped policy's name: training starts from its weights. Empty: from random ones."""
+    num_devices: int = 1
+    """Devices (of each process) that share the environments; the result is that of one, up to the order of sums."""
+    coordinator: str = ""
+    """HOST:PORT on which process 0 listens, where several processes train together."""
+    num_processes: int = 1
+    """Processes that train together, on one machine or many; all see runs_dir."""
+    process_id: int = 0
+    """Which of them this is, from 0."""
     checkpoint_every_updates: int = 8
     loggers: tuple[LoggerName, ...] = ()
     """wandb, mlflow: who gets the numbers besides metrics.jsonl and TensorBoard. Offline, unless WANDB_MODE or
@@ -180,7 +188,7 @@ class TrainConfig:
         for logger in self.loggers:
             require_choice(logger, LoggerName, "loggers")
         require(len(set(self.loggers)) == len(self.loggers), "loggers", self.loggers, "each of them once")
-        for name in ("seed", "steps", "checkpoint_every_updates"):
+        for name in ("seed", "steps", "num_devices", "num_processes", "process_id", "checkpoint_every_updates"):
             value = getattr(self, name)
             require(type(value) is int, name, value, "a whole number")
         require(0 <= self.seed < 2**31, "seed", self.seed, "in [0, 2^31)")
@@ -188,6 +196,7 @@ class TrainConfig:
         require(
             self.checkpoint_every_updates >= 1, "checkpoint_every_updates", self.checkpoint_every_updates, "1 or more"
         )
+        self._require_even_shares()
         is_plain = (
             isinstance(self.run, str) and "/" not in self.run and self.run not in (".", "..") and "\0" not in self.run
         )
@@ -195,6 +204,20 @@ class TrainConfig:
         self._require_room_for_validation_rocks()
         seen = ARCH_OBSERVATION[self.arch]
         require(self.env.obs == seen, "env.obs", self.env.obs, f"{seen} for arch {self.arch}")
+
+    def _require_even_shares(self) -> None:
+        require(self.num_processes >= 1, "num_processes", self.num_processes, "1 or more")
+        should = f"in [0, {self.num_processes}), the number of processes"
+        require(0 <= self.process_id < self.num_processes, "process_id", self.process_id, should)
+        host, colon, port = self.coordinator.rpartition(":")
+        is_address = bool(host and colon and port.isdigit())
+        if self.num_processes > 1 or self.coordinator:
+            require(is_address, "coordinator", self.coordinator, "HOST:PORT of process 0")
+        per_minibatch = self.ppo.num_envs // self.ppo.num_minibatches
+        each = f", in {self.num_processes} processes" if self.num_processes > 1 else ""
+        should = f"a divisor of the {per_minibatch} environments in a minibatch{each} (ppo.num_envs / num_minibatches)"
+        is_share = self.num_devices >= 1 and per_minibatch % (self.num_devices * self.num_processes) == 0
+        require(is_share, "num_devices", self.num_devices, should)
 
     def _require_room_for_validation_rocks(self) -> None:
         rocks = self.evaluation.rocks

@@ -1,17 +1,19 @@
 """``train(config)``: rollouts, updates, held-out evaluation, checkpoints, signals; what a run leaves behind."""
 
 import collections
+import contextlib
 import dataclasses
 import json
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from rich.console import Console
 
 from segvisrl_jax.agent.networks import Network, Params, make_network
 from segvisrl_jax.agent.ppo import Learner, LearnerState, make_learner
@@ -28,10 +30,12 @@ from segvisrl_jax.config import (
 from segvisrl_jax.env.rover_env import RoverEnv, observation_shape
 from segvisrl_jax.env.wrappers import VALIDATION_STREAM, BatchEnv, scene_stream
 from segvisrl_jax.training.checkpoint import Checkpoints, load_policy, save_policy
+from segvisrl_jax.training.devices import ACTOR, BY_ENV, BY_TIME_AND_ENV, EVERYWHERE, TRAJECTORY, Devices
 from segvisrl_jax.training.evaluation import Evaluator, summarize
 from segvisrl_jax.training.loggers import Logger
 from segvisrl_jax.training.metrics import MetricsWriter, ProgressDisplay
 from segvisrl_jax.training.policy import Policy, network_policy
+from segvisrl_jax.training.processes import Processes, join
 from segvisrl_jax.training.rollout import ActorState, EpisodeLog, start_acting, unroll
 from segvisrl_jax.training.stop_signals import StopSignals
 from segvisrl_jax.training.trackers import open_trackers, require_installed
@@ -40,6 +44,7 @@ from segvisrl_jax.types import Outcome
 RECENT_EPISODES = 200  # what the progress bar's shares are taken over
 FREE_ON_RESUME = (
     "steps", "resume", "runs_dir", "run", "evaluation", "checkpoint_every_updates", "preset", "loggers",
+    "num_devices", "coordinator", "num_processes", "process_id",
 )  # fmt: skip
 OUTCOMES = (Outcome.SUCCESS, Outcome.COLLISION, Outcome.FALL, Outcome.TIMEOUT)
 
@@ -79,30 +84,38 @@ class Trainer:
     def __init__(self, config: TrainConfig):
         self.config = config
         env = RoverEnv(config.env)
+        self.devices = Devices(config.num_devices, config.num_processes)
+        shard = self.devices.shard
         self.network: Network = make_network(config.arch, config.network, env.observation_shape)
         draw = jax.vmap(jax.vmap(env.observe)) if config.ppo.redraw_observations else None
-        self.learner: Learner = make_learner(self.network, config.ppo, config.num_updates, draw=draw)
-        self.batch = BatchEnv(env, config.ppo.num_envs)
+        self.learner: Learner = make_learner(self.network, config.ppo, config.num_updates, draw=draw, shard=shard)
+        self.batch = BatchEnv(env, config.ppo.num_envs // shard.count)
         self.policy: Policy = network_policy(self.network, config.arch)
         self.evaluator = Evaluator(RoverEnv(validation_env(config)), self.policy, config.evaluation.num_slots)
-        self._unroll = jax.jit(self._unroll_batch)
+        self._lay_out = self.devices.lay_out(lambda key: key, EVERYWHERE)
+        self._split = self.devices.lay_out(lambda key: tuple(jax.random.split(key)), EVERYWHERE)
+        self._init = self.devices.lay_out(self.learner.init, EVERYWHERE)
+        self._begin = self.devices.lay_out(lambda key: start_acting(key, config.ppo.num_envs, env, self.network), ACTOR)
+        acted = (ACTOR, TRAJECTORY, BY_ENV, BY_TIME_AND_ENV)
+        self._unroll = self.devices.share(jax.jit(self._unroll_batch), (EVERYWHERE, ACTOR), acted)
+        given = (EVERYWHERE, TRAJECTORY, BY_ENV, EVERYWHERE)
+        self._learn = self.devices.share(self.learner.update, given, (EVERYWHERE, EVERYWHERE))
 
     def start(self, params: Params | None = None) -> TrainingState:
         """The state before the first update, with random weights where none are given."""
-        keys = jax.random.split(jax.random.key(self.config.seed), 3)
-        params_key, act_key, update_key = keys
-        learner = jax.jit(self.learner.init)(params_key)
+        params_key, act_key, update_key = jax.random.split(jax.random.key(self.config.seed), 3)
+        learner = self._init(params_key)
         if params is not None:
-            learner = dataclasses.replace(learner, params=jax.tree.map(jnp.asarray, params))
-        actor = jax.jit(lambda key: start_acting(key, self.batch, self.network))(act_key)
-        return TrainingState(learner, actor, update_key)
+            laid_out = jax.tree.map(lambda new, old: jax.device_put(new, old.sharding), params, learner.params)
+            learner = dataclasses.replace(learner, params=laid_out)
+        return TrainingState(learner, self._begin(act_key), self._lay_out(update_key))
 
     def update(self, state: TrainingState) -> tuple[TrainingState, dict[str, Any], EpisodeLog]:
-        """One rollout and one learning update."""
-        next_key, key = jax.random.split(state.update_key)
+        """One rollout and one learning update; the log as NumPy arrays."""
+        next_key, key = self._split(state.update_key)
         actor, trajectory, last_value, log = self.act(state)
-        learner, metrics = self.learner.update(state.learner, trajectory, last_value, key)
-        return TrainingState(learner, actor, next_key), metrics, log
+        learner, metrics = self._learn(state.learner, trajectory, last_value, key)
+        return TrainingState(learner, actor, next_key), metrics, self.devices.gather(log)
 
     def act(self, state: TrainingState):
         """One rollout: see ``rollout.unroll``."""
@@ -111,11 +124,11 @@ class Trainer:
     def evaluate(self, params: Any) -> dict[str, Any]:
         """The current policy on the validation scenes."""
         stream = scene_stream(self.config.seed, VALIDATION_STREAM)
-        finished = self.evaluator.run(params, stream, self.config.evaluation.episodes)
+        finished = self.evaluator.run(self.devices.on_one(params), stream, self.config.evaluation.episodes)
         return summarize(finished, self.evaluator.env)
 
     def _unroll_batch(self, learner: LearnerState, actor: ActorState):
-        return unroll(learner.params, actor, self.batch, self.network, self.config.ppo)
+        return unroll(learner.params, actor, self.batch, self.network, self.config.ppo, self.devices.shard)
 
 
 def held_out_env(config: EnvConfig) -> EnvConfig:
@@ -137,15 +150,31 @@ def train(config: TrainConfig, say=print) -> TrainResult:
     """Runs one training to its end, or to the first SIGINT or SIGTERM, which saves and returns.
 
     Writes config.json, metrics.jsonl, TensorBoard events, checkpoints/ and policy/ (the best one) to the run folder.
+    Where it is one of several processes, it meets the others first, and ends with all of them; where one is lost,
+    this process ends at once (exit code 3).
 
     Raises:
         ConfigError: where the run folder exists and is not to be resumed, or cannot be; where the policy to start from
             is of another architecture, or sees something else; where a logger is not installed or cannot be opened.
     """
+    processes = join(config)
     first_params = _params_to_start_from(config)
     require_installed(config.loggers)
-    run_dir = open_run_dir(config)
-    with MetricsWriter(run_dir, trackers=_open_trackers(config, run_dir), say=say) as writer:
+    run_dir = Path(config.runs_dir) / config.run_name
+    processes.on_first(lambda: open_run_dir(config))
+    result = _train_in(run_dir, config, processes, first_params, say if processes.is_first else _say_nothing)
+    processes.leave()
+    return result
+
+
+def _train_in(
+    run_dir: Path, config: TrainConfig, processes: Processes, first_params: Params | None, say: Callable[[str], None]
+) -> TrainResult:
+    with contextlib.ExitStack() as stack:
+        writer = None
+        if processes.is_first:
+            trackers = _open_trackers(config, run_dir)
+            writer = stack.enter_context(MetricsWriter(run_dir, trackers=trackers, say=say))
         trainer = Trainer(config)
         checkpoints = Checkpoints(run_dir)
         state, host = trainer.start(first_params), HostState()
@@ -155,13 +184,22 @@ def train(config: TrainConfig, say=print) -> TrainResult:
             say(f"going on from update {host.updates} of {config.num_updates}")
         try:
             with StopSignals() as stop:
-                writer.resume_at(host.updates * config.ppo.decisions_per_update)
-                session = _Session(config, run_dir, trainer, checkpoints, writer, stop)
+                if writer:
+                    writer.resume_at(host.updates * config.ppo.decisions_per_update)
+                session = _Session(config, run_dir, trainer, checkpoints, writer, stop, processes)
                 state = session.drive(state, host)
+        except jax.errors.JaxRuntimeError as error:
+            if processes.count > 1:
+                processes.give_up(error, f"{run_dir} has its last checkpoint: start all processes again with --resume")
+            raise
         finally:
             checkpoints.close()
     done = host.updates * config.ppo.decisions_per_update
     return TrainResult(run_dir, host.updates >= config.num_updates, done, host.seconds)
+
+
+def _say_nothing(line: str) -> None:
+    """Of the processes beside the first one."""
 
 
 def _open_trackers(config: TrainConfig, run_dir: Path) -> dict[str, Logger]:
@@ -195,8 +233,9 @@ class _Session:
     run_dir: Path
     trainer: Trainer
     checkpoints: Checkpoints
-    writer: MetricsWriter
+    writer: MetricsWriter | None  # of the first process
     stop: StopSignals
+    processes: Processes
 
     def drive(self, state: TrainingState, host: HostState) -> TrainingState:
         """Updates until the run's end or a signal; the last state is always saved."""
@@ -204,8 +243,9 @@ class _Session:
         recent = collections.deque(host.recent, maxlen=RECENT_EPISODES)
         every = -(-config.evaluation.every_decisions // config.ppo.decisions_per_update)
         total = config.num_updates * config.ppo.decisions_per_update
-        with ProgressDisplay(total, self._decisions(host), config.run_name) as display:
-            while host.updates < config.num_updates and not self.stop.requested:
+        console = None if self.processes.is_first else Console(quiet=True)
+        with ProgressDisplay(total, self._decisions(host), config.run_name, console) as display:
+            while host.updates < config.num_updates and not self.processes.any(self.stop.requested):
                 began = time.monotonic()
                 state, metrics, log = self.trainer.update(state)
                 recent.extend(_finished_episodes(log))
@@ -232,7 +272,8 @@ class _Session:
         if rank >= (host.best or rank):
             host.best = rank
             scores = {**summary, "scenes": "validation", "decisions": self._decisions(host)}
-            save_policy(self.run_dir / "policy", self.config, state.learner.params, scores)
+            if self.processes.is_first:
+                save_policy(self.run_dir / "policy", self.config, state.learner.params, scores)
         low, high = summary.pop("success_ci95")
         kept = {k: v for k, v in summary.items() if isinstance(v, float)}
         kept |= {"success_low": low, "success_high": high}
@@ -240,7 +281,8 @@ class _Session:
 
     def _report(self, row: dict[str, float], host: HostState, display: ProgressDisplay) -> None:
         decisions = self._decisions(host)
-        self.writer.write(decisions, row)
+        if self.writer:
+            self.writer.write(decisions, row)
         display.update(decisions, row)
 
     def _save(self, state: TrainingState, host: HostState) -> None:

@@ -11,7 +11,9 @@ from jaxtyping import Array, Float32, Int32, PRNGKeyArray
 from segvisrl_jax.agent.distributions import DiagonalGaussian
 from segvisrl_jax.agent.loss import Trajectory
 from segvisrl_jax.agent.networks import Network
+from segvisrl_jax.agent.shard import WHOLE, Shard
 from segvisrl_jax.config import PPOConfig
+from segvisrl_jax.env.rover_env import RoverEnv
 from segvisrl_jax.env.wrappers import BatchEnv, BatchState, BatchStep
 from segvisrl_jax.types import RewardTerms
 
@@ -36,22 +38,22 @@ class EpisodeLog:
     terms: RewardTerms
 
 
-def start_acting(key: PRNGKeyArray, env: BatchEnv, network: Network) -> ActorState:
+def start_acting(key: PRNGKeyArray, num_envs: int, env: RoverEnv, network: Network) -> ActorState:
     """Fresh environments, empty memory."""
     env_key, act_key = jax.random.split(key)
-    return ActorState(env.reset(env_key), network.initial_carry((env.num_envs,)), act_key)
+    return ActorState(BatchEnv(env, num_envs).reset(env_key), network.initial_carry((num_envs,)), act_key)
 
 
 def unroll(
-    params: Any, actor: ActorState, env: BatchEnv, network: Network, config: PPOConfig
+    params: Any, actor: ActorState, env: BatchEnv, network: Network, config: PPOConfig, shard: Shard = WHOLE
 ) -> tuple[ActorState, Trajectory, Float32[Array, "B"], EpisodeLog]:
-    """Drives ``config.unroll_length`` decisions.
+    """Drives ``config.unroll_length`` decisions of B environments, which are a ``shard`` of all.
 
     Returns:
         The actor afterwards; the trajectory (T, B) with the carry it began with; the value (B,) of where it ends;
         the episodes' log (T, B).
     """
-    decide = functools.partial(_decide, env=env, network=network, config=config)
+    decide = functools.partial(_decide, env=env, network=network, config=config, shard=shard)
     after, (steps, log) = jax.lax.scan(lambda state, _: decide(params, state), actor, None, length=config.unroll_length)
     trajectory = Trajectory(carry=actor.carry, **steps)
     observation = env.observe(after.env)
@@ -60,13 +62,13 @@ def unroll(
 
 
 def _decide(
-    params: Any, actor: ActorState, env: BatchEnv, network: Network, config: PPOConfig
+    params: Any, actor: ActorState, env: BatchEnv, network: Network, config: PPOConfig, shard: Shard
 ) -> tuple[ActorState, tuple[dict[str, Any], EpisodeLog]]:
     next_key, action_key = jax.random.split(actor.key)
     observation = env.observe(actor.env)
     carry, output = network.step(params, actor.carry, observation, actor.env.is_first)
     distribution = DiagonalGaussian(output.mean, output.log_std)
-    action = distribution.sample(key=action_key)
+    action = distribution.sample(key=action_key, shard=shard)
     after, step = env.step(actor.env, action)
     kept = {
         "observation": actor.env.rover if config.redraw_observations else observation,

@@ -28,7 +28,7 @@ def roll(parts, config, times=1):
     env, network = parts
     params = network.init(jax.random.key(1))
     act = jax.jit(functools.partial(unroll, env=env, network=network, config=config))
-    actor = start_acting(jax.random.key(2), env, network)
+    actor = start_acting(jax.random.key(2), env.num_envs, env.env, network)
     for _ in range(times):
         actor, trajectory, last_value, log = act(params, actor)
     return params, actor, trajectory, last_value, log

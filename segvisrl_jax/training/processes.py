@@ -1,0 +1,94 @@
+"""One run in several processes, on one machine or many: who they are, and what they tell each other.
+
+Each process has devices and environments of its own and computes the same numbers from all of them; the first one alone
+writes and says anything. Checkpoints are written by all (orbax), so the run's folder is one that all processes see.
+"""
+
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NoReturn
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+
+from segvisrl_jax.config import ConfigError, TrainConfig
+
+HEARTBEAT_S = 30  # a process that has not been heard of for this long is given up by the others
+JOIN_S = 300  # how long the first ones wait for the last one
+LOST = 3  # exit code where another process is gone
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Those that share a run; alone, every method does nothing but what it says for one."""
+
+    count: int = 1
+    index: int = 0
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this is the process that writes and reports."""
+        return self.index == 0
+
+    def any(self, asked: bool) -> bool:
+        """Whether any process asks; all have to call this, and all get the same answer."""
+        if self.count == 1:
+            return asked
+        return bool(np.any(multihost_utils.process_allgather(np.array(asked))))
+
+    def on_first(self, do: Callable[[], object]) -> None:
+        """Does it in the first process; the others wait.
+
+        Raises:
+            ConfigError: in all of them, where it does in the first.
+        """
+        failed: ConfigError | None = None
+        if self.is_first:
+            try:
+                do()
+            except ConfigError as error:
+                failed = error
+        if self.any(failed is not None):
+            raise failed or ConfigError("the first process refused; it says why")
+
+    def leave(self) -> None:
+        """Parts from the others, once all are done."""
+        if self.count > 1:
+            jax.distributed.shutdown()
+
+    def give_up(self, error: Exception, how_to_go_on: str) -> NoReturn:
+        """Ends this process at once, where another one is gone: nothing that waits for all of them ends any more."""
+        reason = str(error).strip().splitlines()[0][:200]
+        print(f"segvisrl train: another process of this run is gone ({reason})\n{how_to_go_on}", file=sys.stderr)
+        sys.stderr.flush()
+        sys.stdout.flush()
+        os._exit(LOST)
+
+
+def join(config: TrainConfig) -> Processes:
+    """Meets the other processes of the run; before JAX's first array.
+
+    Raises:
+        ConfigError: where they do not come together.
+    """
+    if config.num_processes == 1:
+        return Processes()
+    if not jax.distributed.is_initialized():
+        try:
+            jax.distributed.initialize(
+                config.coordinator,
+                config.num_processes,
+                config.process_id,
+                initialization_timeout=JOIN_S,
+                heartbeat_timeout_seconds=HEARTBEAT_S,
+            )
+        except (RuntimeError, ValueError) as error:
+            reason = str(error).strip().splitlines()[0][:200]
+            raise ConfigError(
+                f"coordinator = {config.coordinator!r}: should be where process 0 listens, "
+                f"reached by all {config.num_processes} processes ({reason})"
+            ) from None
+    return Processes(config.num_processes, config.process_id)

@@ -1,0 +1,116 @@
+"""Several processes that train together are one run: two real ones, over loopback."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from segvisrl_jax.config import ConfigError, TrainConfig
+
+COUNT, START_S, END_S = 2, 400, 60
+TINY = """--arch mlp --preset smoke --ppo.num-envs 16 --ppo.unroll-length 8 --ppo.num-minibatches 2 --run run
+    --evaluation.episodes 4 --evaluation.every-decisions 256 --env.task.max-decisions 12"""
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def start(folder, words, count=COUNT):
+    """``segvisrl train`` in ``count`` processes, their output in ``folder``/0, /1, ..."""
+    folder.mkdir(exist_ok=True)
+    common = [
+        sys.executable,
+        "-m",
+        "segvisrl_jax.cli",
+        "train",
+        *TINY.split(),
+        "--runs-dir",
+        str(folder),
+        *words.split(),
+    ]
+    port = free_port()
+    processes = []
+    for i in range(count):
+        told = ["--coordinator", f"127.0.0.1:{port}", "--num-processes", str(count), "--process-id", str(i)]
+        with (folder / str(i)).open("wb") as output:
+            command = [*common, *(told if count > 1 else [])]
+            processes.append(subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT))
+    return processes
+
+
+def wait(folder, processes, seconds=START_S):
+    """Their exit codes, and what they said."""
+    try:
+        codes = [process.wait(seconds) for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    return codes, [(folder / str(i)).read_text() for i in range(len(processes))]
+
+
+def rows(folder):
+    file = folder / "run" / "metrics.jsonl"
+    lines = file.read_text().splitlines() if file.exists() else []
+    return [{name: value for name, value in json.loads(line).items() if "time" not in name} for line in lines]
+
+
+@pytest.mark.slow
+def test_two_processes_train_as_one_does(tmp_path):
+    one, two = tmp_path / "one", tmp_path / "two"
+    (code,), said = wait(one, start(one, "--steps 384", count=1))
+    assert code == 0, said
+    codes, said = wait(two, start(two, "--steps 384"))
+    assert codes == [0, 0], said
+    assert "test scenes" in said[0]
+    assert "success" not in said[1]  # one of them reports
+    assert len(rows(one)) == len(rows(two)) == 3
+    for row, same in zip(rows(one), rows(two), strict=True):
+        assert row.keys() == same.keys()
+        np.testing.assert_allclose(list(row.values()), list(same.values()), rtol=2e-3, atol=2e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("victim", range(COUNT))
+def test_one_is_killed_the_other_ends_and_the_run_goes_on(victim, tmp_path):
+    folder = tmp_path / "runs"
+    processes = start(folder, "--steps 1e6 --checkpoint-every-updates 4 --evaluation.every-decisions 1e6")
+    deadline = time.monotonic() + START_S
+    while len(rows(folder)) < 10 and time.monotonic() < deadline:
+        assert all(process.poll() is None for process in processes), (folder / "0").read_text()
+        time.sleep(0.5)
+    processes[victim].kill()
+    codes, said = wait(folder, processes, END_S)
+    assert codes[victim] == -signal.SIGKILL
+    assert codes[1 - victim] in (3, -signal.SIGABRT), said  # the latter where JAX itself notices first
+    assert "another" in said[1 - victim]  # process, or task, died
+    reached = max(int(name) for name in os.listdir(folder / "run" / "checkpoints") if name.isdigit())
+    assert reached >= 8
+    steps = 128 * (reached + 1)
+    codes, said = wait(folder, start(folder, f"--resume --steps {steps}"))
+    assert codes == [0, 0], said
+    assert f"going on from update {reached} of {reached + 1}" in said[0]
+    assert len(rows(folder)) == reached + 1
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"num_processes": 0}, "num_processes = 0: should be 1 or more"),
+        ({"num_processes": 2, "process_id": 2}, r"process_id = 2: should be in \[0, 2\)"),
+        ({"num_processes": 2}, "coordinator = '': should be HOST:PORT"),
+        ({"num_processes": 2, "coordinator": "here"}, "coordinator = 'here': should be HOST:PORT"),
+        ({"num_processes": 3, "coordinator": "a:1"}, "num_devices = 1: should be a divisor of the 4 environments"),
+    ],
+)
+def test_what_makes_no_group_is_said(settings, says):
+    with pytest.raises(ConfigError, match=says):
+        TrainConfig(**settings)
