@@ -15,6 +15,7 @@ from segvisrl_jax.config import (
     flatten,
     from_dict,
     preset_config,
+    replace_fields,
     require,
     to_dict,
 )
@@ -64,9 +65,10 @@ def _stored_config(runs_dir: str, run_name: str) -> TrainConfig | None:
     if not run_name or not file.is_file():
         return None
     try:
-        return from_dict(TrainConfig, json.loads(file.read_text()))
+        stored = from_dict(TrainConfig, json.loads(file.read_text()))
     except ValueError as error:
         raise ConfigError(f"{file}: not a run's settings ({error})") from None
+    return replace_fields(stored, coordinator="", num_processes=1, process_id=0)  # who goes on, says so
 
 
 def preset_for_this_machine() -> PresetName:

@@ -133,3 +133,16 @@ def test_no_cluster_is_said_in_one_line(tmp_path, monkeypatch, capsys):
         assert main(words) == 2
         shown = capsys.readouterr().err
         assert f"--ray-address = {address!r}: should be a Ray cluster that answers" in shown
+
+
+@pytest.mark.slow
+def test_one_run_on_two_nodes(tmp_path, cluster):
+    script = Path(__file__).parents[2] / "deploy" / "train_on_ray.py"
+    words = ["--preset", "smoke", "--steps", "256", *TINY, "--run", "both", "--runs-dir", str(tmp_path)]
+    command = [sys.executable, str(script), "2", "--address", cluster.address, *words]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "JAX_PLATFORMS": "cpu"})
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("test scenes:") == 1
+    config = json.loads((tmp_path / "both" / "config.json").read_text())
+    assert config["num_processes"] == 2
+    assert (tmp_path / "both" / "policy" / "params.npz").exists()
