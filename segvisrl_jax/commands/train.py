@@ -37,10 +37,15 @@ def run(options: Sequence[str]) -> int:
     if not is_first:
         return 0 if result.finished else INTERRUPTED
     resume = f"segvisrl train --resume --runs-dir {config.runs_dir} --run {config.run_name}"
+    if config.num_seeds > 1:
+        resume += f" --seed {config.seed} --num-seeds {config.num_seeds}"
     if not result.finished:
         print(f"Stopped and saved after {result.decisions:,} decisions. Go on with:\n  {resume}")
         return INTERRUPTED
-    _finish(config, result.run_dir)
+    for each, run_dir in zip(config.runs, result.run_dirs, strict=True):
+        _finish(each, run_dir)
+    if config.num_seeds > 1:
+        print(f"All seeds: {_draw_together(config, result.run_dirs)}")
     return 0
 
 
@@ -49,7 +54,10 @@ def parse_config(options: Sequence[str]) -> TrainConfig:
     words = [word for option in options for word in _split_equals(option)]
     arch, preset = _value(words, "--arch", "cnn_lstm"), _value(words, "--preset", "auto")
     if "--resume" in words:
-        base = _stored_config(_value(words, "--runs-dir", "runs"), _value(words, "--run", ""))
+        runs_dir, name = _value(words, "--runs-dir", "runs"), _value(words, "--run", "")
+        if _value(words, "--num-seeds", "1") != "1":
+            name += f"-seed{_value(words, '--seed', '0')}"  # the first of them; the option itself takes its place
+        base = _stored_config(runs_dir, name)
         if base is not None:
             return parse(TrainConfig, words, "train", base)
     if preset == "auto":
@@ -104,7 +112,7 @@ def differences_from_paper(config: TrainConfig) -> str:
     ours = flatten(to_dict(config))
     bookkeeping = (
         "seed", "run", "runs_dir", "resume", "preset", "checkpoint_every_updates", "loggers",
-        "num_devices", "coordinator", "num_processes", "process_id",
+        "num_seeds", "num_devices", "coordinator", "num_processes", "process_id",
     )  # fmt: skip
     rows = [
         f"  {name:<34} {_short(value):>12}   paper {_short(paper[name])}"
@@ -131,6 +139,14 @@ def observation_memory(config: TrainConfig) -> str:
 
 def _short(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def _draw_together(config: TrainConfig, run_dirs: Sequence[Path]) -> Path:
+    """The learning curves of all seeds: the median and a band."""
+    from segvisrl_jax.report.learning_curves import draw_learning_curves, read_curves
+
+    path = Path(config.runs_dir) / f"{config.run_name}-learning_curves.png"
+    return draw_learning_curves(read_curves(run_dirs), path)
 
 
 def _finish(config: TrainConfig, run_dir: Path) -> None:

@@ -155,6 +155,8 @@ class TrainConfig:
     """Go on from the run folder's last checkpoint."""
     start_from: str = ""
     """A policy's folder, or a shipped policy's name: training starts from its weights. Empty: from random ones."""
+    num_seeds: int = 1
+    """Runs that are trained at once, in one program: with seed, seed + 1, ..., each in a folder of its own."""
     num_devices: int = 1
     """Devices (of each process) that share the environments; the result is that of one, up to the order of sums."""
     coordinator: str = ""
@@ -173,9 +175,18 @@ class TrainConfig:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
     @property
+    def runs(self) -> tuple["TrainConfig", ...]:
+        """The settings of each run: this one, or one for each of ``num_seeds``."""
+        if self.num_seeds == 1:
+            return (self,)
+        seeds = range(self.seed, self.seed + self.num_seeds)
+        return tuple(replace(self, seed=seed, run=f"{self.run_name}-seed{seed}", num_seeds=1) for seed in seeds)
+
+    @property
     def run_name(self) -> str:
-        """The run folder's name."""
-        return self.run or f"{self.arch}-{self.preset}-seed{self.seed}"
+        """The run folder's name; of several seeds, what their folders' names begin with."""
+        name = f"{self.arch}-{self.preset}"
+        return self.run or (name if self.num_seeds > 1 else f"{name}-seed{self.seed}")
 
     @property
     def num_updates(self) -> int:
@@ -188,10 +199,19 @@ class TrainConfig:
         for logger in self.loggers:
             require_choice(logger, LoggerName, "loggers")
         require(len(set(self.loggers)) == len(self.loggers), "loggers", self.loggers, "each of them once")
-        for name in ("seed", "steps", "num_devices", "num_processes", "process_id", "checkpoint_every_updates"):
+        for name in (
+            "seed",
+            "steps",
+            "num_seeds",
+            "num_devices",
+            "num_processes",
+            "process_id",
+            "checkpoint_every_updates",
+        ):
             value = getattr(self, name)
             require(type(value) is int, name, value, "a whole number")
         require(0 <= self.seed < 2**31, "seed", self.seed, "in [0, 2^31)")
+        require(1 <= self.num_seeds <= 1024, "num_seeds", self.num_seeds, "in [1, 1024]")
         require(1 <= self.steps <= 10**12, "steps", self.steps, "in [1, 10^12]")
         require(
             self.checkpoint_every_updates >= 1, "checkpoint_every_updates", self.checkpoint_every_updates, "1 or more"
@@ -218,6 +238,8 @@ class TrainConfig:
         should = f"a divisor of the {per_minibatch} environments in a minibatch{each} (ppo.num_envs / num_minibatches)"
         is_share = self.num_devices >= 1 and per_minibatch % (self.num_devices * self.num_processes) == 0
         require(is_share, "num_devices", self.num_devices, should)
+        alone = self.num_seeds == 1 or self.num_devices * self.num_processes == 1
+        require(alone, "num_seeds", self.num_seeds, "1 where several devices or processes train")
 
     def _require_room_for_validation_rocks(self) -> None:
         rocks = self.evaluation.rocks

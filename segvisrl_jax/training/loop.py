@@ -1,52 +1,33 @@
 """``train(config)``: rollouts, updates, held-out evaluation, checkpoints, signals; what a run leaves behind."""
 
-import collections
 import contextlib
 import dataclasses
-import json
-import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from rich.console import Console
 
 from segvisrl_jax.agent.networks import Network, Params, make_network
 from segvisrl_jax.agent.ppo import Learner, LearnerState, make_learner
-from segvisrl_jax.config import (
-    ConditionsConfig,
-    ConfigError,
-    EnvConfig,
-    TrainConfig,
-    flatten,
-    replace_fields,
-    require,
-    to_dict,
-)
+from segvisrl_jax.config import ConditionsConfig, EnvConfig, TrainConfig, replace_fields, require
 from segvisrl_jax.env.rover_env import RoverEnv, observation_shape
 from segvisrl_jax.env.wrappers import VALIDATION_STREAM, BatchEnv, scene_stream
-from segvisrl_jax.training.checkpoint import Checkpoints, load_policy, save_policy
+from segvisrl_jax.training.checkpoint import load_policy
 from segvisrl_jax.training.devices import ACTOR, BY_ENV, BY_TIME_AND_ENV, EVERYWHERE, TRAJECTORY, Devices
 from segvisrl_jax.training.evaluation import Evaluator, summarize
-from segvisrl_jax.training.loggers import Logger
-from segvisrl_jax.training.metrics import MetricsWriter, ProgressDisplay
+from segvisrl_jax.training.metrics import ProgressDisplay
 from segvisrl_jax.training.policy import Policy, network_policy
 from segvisrl_jax.training.processes import Processes, join
 from segvisrl_jax.training.rollout import ActorState, EpisodeLog, start_acting, unroll
+from segvisrl_jax.training.run import Run, open_run_dirs
 from segvisrl_jax.training.stop_signals import StopSignals
-from segvisrl_jax.training.trackers import open_trackers, require_installed
-from segvisrl_jax.types import Outcome
-
-RECENT_EPISODES = 200  # what the progress bar's shares are taken over
-FREE_ON_RESUME = (
-    "steps", "resume", "runs_dir", "run", "evaluation", "checkpoint_every_updates", "preset", "loggers",
-    "num_devices", "coordinator", "num_processes", "process_id",
-)  # fmt: skip
-OUTCOMES = (Outcome.SUCCESS, Outcome.COLLISION, Outcome.FALL, Outcome.TIMEOUT)
+from segvisrl_jax.training.trackers import require_installed
 
 
 @struct.dataclass
@@ -58,28 +39,26 @@ class TrainingState:
     update_key: jax.Array
 
 
-@dataclasses.dataclass
-class HostState:
-    """Everything on the host that goes into a checkpoint, as JSON data."""
-
-    updates: int = 0
-    seconds: float = 0.0  # spent training, over all sessions of the run
-    recent: list[list[float]] = dataclasses.field(default_factory=list)  # outcome, return, decisions
-    best: list[float] = dataclasses.field(default_factory=list)  # rank of the best policy so far
-
-
 @dataclasses.dataclass(frozen=True)
 class TrainResult:
-    """Where a run is and how it ended."""
+    """Where runs are and how they ended."""
 
-    run_dir: Path
+    run_dirs: tuple[Path, ...]  # one for each seed
     finished: bool  # False where a signal ended it early
     decisions: int
     seconds: float
 
+    @property
+    def run_dir(self) -> Path:
+        """The folder of the first seed."""
+        return self.run_dirs[0]
+
 
 class Trainer:
-    """One run: builds every part from the config, then updates until done or told to stop."""
+    """Builds every part from the config, and updates: one run, or K of them at once (``num_seeds``).
+
+    Of K runs, everything in the state, metrics and log is (K, ...).
+    """
 
     def __init__(self, config: TrainConfig):
         self.config = config
@@ -101,12 +80,40 @@ class Trainer:
         given = (EVERYWHERE, TRAJECTORY, BY_ENV, EVERYWHERE)
         self._learn = self.devices.share(self.learner.update, given, (EVERYWHERE, EVERYWHERE))
 
+        if config.num_seeds > 1:
+            self._train_seeds_together()
+
+    def _train_seeds_together(self) -> None:
+        """Has every program do its work for all seeds; what it takes and gives is (K, ...).
+
+        One program for all where the learner is one; else one seed after the other: XLA on a CPU is very slow at
+        convolutions whose kernels differ.
+        """
+        for name in ("_lay_out", "_split", "_init", "_begin", "_unroll", "_learn"):
+            work = getattr(self, name)
+            together = jax.jit(jax.vmap(work)) if self.learner.execution == "fused" else self._in_turn(work)
+            setattr(self, name, together)
+
+    def _in_turn(self, work: Callable[..., Any]) -> Callable[..., Any]:
+        seeds = range(self.config.num_seeds)
+        return lambda *given: self.of_seeds([work(*self.of_seed(given, i)) for i in seeds])
+
+    def of_seed(self, tree: Any, index: int) -> Any:
+        """One seed's part of what all have; all of it where there is one."""
+        return tree if self.config.num_seeds == 1 else jax.tree.map(lambda leaf: leaf[index], tree)
+
+    def of_seeds(self, trees: Sequence[Any]) -> Any:
+        """The inverse of ``of_seed``."""
+        return trees[0] if len(trees) == 1 else jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
     def start(self, params: Params | None = None) -> TrainingState:
         """The state before the first update, with random weights where none are given."""
-        params_key, act_key, update_key = jax.random.split(jax.random.key(self.config.seed), 3)
+        drawn = [jax.random.split(jax.random.key(run.seed), 3) for run in self.config.runs]
+        params_key, act_key, update_key = self.of_seeds([tuple(keys) for keys in drawn])
         learner = self._init(params_key)
         if params is not None:
-            laid_out = jax.tree.map(lambda new, old: jax.device_put(new, old.sharding), params, learner.params)
+            given = self.of_seeds([params] * self.config.num_seeds)
+            laid_out = jax.tree.map(lambda new, old: jax.device_put(new, old.sharding), given, learner.params)
             learner = dataclasses.replace(learner, params=laid_out)
         return TrainingState(learner, self._begin(act_key), self._lay_out(update_key))
 
@@ -121,9 +128,9 @@ class Trainer:
         """One rollout: see ``rollout.unroll``."""
         return self._unroll(state.learner, state.actor)
 
-    def evaluate(self, params: Any) -> dict[str, Any]:
-        """The current policy on the validation scenes."""
-        stream = scene_stream(self.config.seed, VALIDATION_STREAM)
+    def evaluate(self, params: Any, seed: int | None = None) -> dict[str, Any]:
+        """A policy on the validation scenes of a seed."""
+        stream = scene_stream(self.config.seed if seed is None else seed, VALIDATION_STREAM)
         finished = self.evaluator.run(self.devices.on_one(params), stream, self.config.evaluation.episodes)
         return summarize(finished, self.evaluator.env)
 
@@ -147,7 +154,7 @@ def validation_env(config: TrainConfig) -> EnvConfig:
 
 
 def train(config: TrainConfig, say=print) -> TrainResult:
-    """Runs one training to its end, or to the first SIGINT or SIGTERM, which saves and returns.
+    """Runs one training, or one of every seed, to its end, or to the first SIGINT or SIGTERM, which saves and returns.
 
     Writes config.json, metrics.jsonl, TensorBoard events, checkpoints/ and policy/ (the best one) to the run folder.
     Where it is one of several processes, it meets the others first, and ends with all of them; where one is lost,
@@ -160,56 +167,25 @@ def train(config: TrainConfig, say=print) -> TrainResult:
     processes = join(config)
     first_params = _params_to_start_from(config)
     require_installed(config.loggers)
-    run_dir = Path(config.runs_dir) / config.run_name
-    processes.on_first(lambda: open_run_dir(config))
-    result = _train_in(run_dir, config, processes, first_params, say if processes.is_first else _say_nothing)
-    processes.leave()
-    return result
-
-
-def _train_in(
-    run_dir: Path, config: TrainConfig, processes: Processes, first_params: Params | None, say: Callable[[str], None]
-) -> TrainResult:
+    processes.on_first(lambda: open_run_dirs(config))
     with contextlib.ExitStack() as stack:
-        writer = None
-        if processes.is_first:
-            trackers = _open_trackers(config, run_dir)
-            writer = stack.enter_context(MetricsWriter(run_dir, trackers=trackers, say=say))
-        trainer = Trainer(config)
-        checkpoints = Checkpoints(run_dir)
-        state, host = trainer.start(first_params), HostState()
-        if config.resume:
-            state, data = checkpoints.restore_latest(state)
-            host = HostState(**data)
-            say(f"going on from update {host.updates} of {config.num_updates}")
+        runs = []
+        for each in config.runs:
+            runs.append(Run(each, processes, say if processes.is_first else _say_nothing))
+            stack.callback(runs[-1].close)
         try:
-            with StopSignals() as stop:
-                if writer:
-                    writer.resume_at(host.updates * config.ppo.decisions_per_update)
-                session = _Session(config, run_dir, trainer, checkpoints, writer, stop, processes)
-                state = session.drive(state, host)
+            finished = _Session(Trainer(config), runs, processes).drive(first_params)
         except jax.errors.JaxRuntimeError as error:
-            if processes.count > 1:
-                processes.give_up(error, f"{run_dir} has its last checkpoint: start all processes again with --resume")
+            if processes.count > 1:  # at once: closing would wait for those who are gone
+                where = f"{runs[0].folder} has its last checkpoint"
+                processes.give_up(error, f"{where}: start all processes again with --resume")
             raise
-        finally:
-            checkpoints.close()
-    done = host.updates * config.ppo.decisions_per_update
-    return TrainResult(run_dir, host.updates >= config.num_updates, done, host.seconds)
+    processes.leave()
+    return TrainResult(tuple(run.folder for run in runs), finished, runs[0].decisions, runs[0].host.seconds)
 
 
 def _say_nothing(line: str) -> None:
     """Of the processes beside the first one."""
-
-
-def _open_trackers(config: TrainConfig, run_dir: Path) -> dict[str, Logger]:
-    """What the settings name; where that fails, a new run leaves no folder behind that would be in the way."""
-    try:
-        return open_trackers(config, run_dir)
-    except ConfigError:
-        if not config.resume:
-            shutil.rmtree(run_dir)
-        raise
 
 
 def _params_to_start_from(config: TrainConfig) -> Params | None:
@@ -227,116 +203,79 @@ def _params_to_start_from(config: TrainConfig) -> Params | None:
 
 @dataclasses.dataclass
 class _Session:
-    """One sitting of a run."""
+    """One sitting of the runs that a trainer trains."""
 
-    config: TrainConfig
-    run_dir: Path
     trainer: Trainer
-    checkpoints: Checkpoints
-    writer: MetricsWriter | None  # of the first process
-    stop: StopSignals
+    runs: Sequence[Run]
     processes: Processes
 
-    def drive(self, state: TrainingState, host: HostState) -> TrainingState:
-        """Updates until the run's end or a signal; the last state is always saved."""
-        config = self.config
-        recent = collections.deque(host.recent, maxlen=RECENT_EPISODES)
+    def drive(self, first_params: Params | None) -> bool:
+        """Updates until the end or a signal, and saves; whether it is the end."""
+        config = self.trainer.config
+        state = self._start(first_params)
+        for run in self.runs:
+            run.begin()
         every = -(-config.evaluation.every_decisions // config.ppo.decisions_per_update)
         total = config.num_updates * config.ppo.decisions_per_update
         console = None if self.processes.is_first else Console(quiet=True)
-        with ProgressDisplay(total, self._decisions(host), config.run_name, console) as display:
-            while host.updates < config.num_updates and not self.processes.any(self.stop.requested):
-                began = time.monotonic()
-                state, metrics, log = self.trainer.update(state)
-                recent.extend(_finished_episodes(log))
-                host.updates += 1
-                row = _row(jax.device_get(metrics), log, recent)
-                host.seconds += time.monotonic() - began
-                row |= self._speed(host, time.monotonic() - began)
-                if host.updates % every == 0 or host.updates == config.num_updates:
-                    row |= self._evaluate(state, host)
-                self._report(row, host, display)
-                host.recent = [list(episode) for episode in recent]
-                if host.updates % config.checkpoint_every_updates == 0:
-                    self._save(state, host)
-        self._save(state, host)
-        return state
+        with StopSignals() as stop, ProgressDisplay(total, self._decisions, self._name, console) as display:
+            while self._updates < config.num_updates and not self.processes.any(stop.requested):
+                state, rows = self._update(state)
+                if self._updates % every == 0 or self._updates == config.num_updates:
+                    self._evaluate(state, rows)
+                for run, row in zip(self.runs, rows, strict=True):
+                    run.write(row)
+                display.update(self._decisions, _median(rows))
+                if self._updates % config.checkpoint_every_updates == 0:
+                    self._save(state)
+        self._save(state)
+        return self._updates >= config.num_updates
 
-    def _speed(self, host: HostState, seconds: float) -> dict[str, float]:
-        decisions = self.config.ppo.decisions_per_update
-        return {"time/seconds": host.seconds, "time/decisions_per_second": decisions / seconds}
+    def _start(self, first_params: Params | None) -> TrainingState:
+        state = self.trainer.start(first_params)
+        if not self.trainer.config.resume:
+            return state
+        restored = [run.restore(self.trainer.of_seed(state, i)) for i, run in enumerate(self.runs)]
+        reached = [run.host.updates for run in self.runs]
+        same = len(set(reached)) == 1
+        require(same, "num_seeds", len(self.runs), f"1, for each run by itself: they have made {reached} updates")
+        return self.trainer.of_seeds(restored)
 
-    def _evaluate(self, state: TrainingState, host: HostState) -> dict[str, float]:
-        summary = self.trainer.evaluate(state.learner.params)
-        rank = [summary["success"], -summary["collision"], summary["spl"]]
-        if rank >= (host.best or rank):
-            host.best = rank
-            scores = {**summary, "scenes": "validation", "decisions": self._decisions(host)}
-            if self.processes.is_first:
-                save_policy(self.run_dir / "policy", self.config, state.learner.params, scores)
-        low, high = summary.pop("success_ci95")
-        kept = {k: v for k, v in summary.items() if isinstance(v, float)}
-        kept |= {"success_low": low, "success_high": high}
-        return {f"evaluation/{name}": value for name, value in kept.items()}
+    def _update(self, state: TrainingState) -> tuple[TrainingState, list[dict[str, float]]]:
+        began = time.monotonic()
+        state, metrics, log = self.trainer.update(state)
+        metrics = jax.device_get(metrics)
+        seconds = time.monotonic() - began
+        of_seed = self.trainer.of_seed
+        told = [(of_seed(metrics, i), of_seed(log, i)) for i in range(len(self.runs))]
+        return state, [run.count(numbers, ends, seconds) for run, (numbers, ends) in zip(self.runs, told, strict=True)]
 
-    def _report(self, row: dict[str, float], host: HostState, display: ProgressDisplay) -> None:
-        decisions = self._decisions(host)
-        if self.writer:
-            self.writer.write(decisions, row)
-        display.update(decisions, row)
+    def _evaluate(self, state: TrainingState, rows: list[dict[str, float]]) -> None:
+        for i, run in enumerate(self.runs):
+            params = self.trainer.of_seed(state.learner.params, i)
+            rows[i] |= run.judge(self.trainer.evaluate(params, run.config.seed), params)
 
-    def _save(self, state: TrainingState, host: HostState) -> None:
-        self.checkpoints.save(host.updates, state, dataclasses.asdict(host))
+    def _save(self, state: TrainingState) -> None:
+        for i, run in enumerate(self.runs):
+            run.save(self.trainer.of_seed(state, i))
 
-    def _decisions(self, host: HostState) -> int:
-        return host.updates * self.config.ppo.decisions_per_update
+    @property
+    def _updates(self) -> int:
+        return self.runs[0].host.updates
 
+    @property
+    def _decisions(self) -> int:
+        return self.runs[0].decisions
 
-def open_run_dir(config: TrainConfig) -> Path:
-    """Makes the run's folder and writes the resolved config, or checks that it can be resumed.
-
-    Raises:
-        ConfigError: where it exists already and ``resume`` is off, or has nothing to resume, or was another run.
-    """
-    run_dir = Path(config.runs_dir) / config.run_name
-    config_file = run_dir / "config.json"
-    if not config.resume:
-        if run_dir.exists() and any(run_dir.iterdir()):
-            raise ConfigError(f"run = {str(run_dir)!r}: exists already; go on with --resume, or choose another --run")
-        run_dir.mkdir(parents=True, exist_ok=True)
-        config_file.write_text(json.dumps(to_dict(config), indent=2) + "\n")
-        return run_dir
-    if not (run_dir / "checkpoints").is_dir() or not config_file.is_file():
-        raise ConfigError(f"run = {str(run_dir)!r}: has no checkpoint to resume; leave --resume out")
-    _require_same_run(config, json.loads(config_file.read_text()), run_dir)
-    return run_dir
+    @property
+    def _name(self) -> str:
+        name, more = self.runs[0].config.run_name, len(self.runs) - 1
+        return f"{name} and {more} more" if more else name
 
 
-def _require_same_run(config: TrainConfig, before: dict[str, Any], run_dir: Path) -> None:
-    """Only the number of steps and bookkeeping may change when a run goes on. What old runs do not say is neutral."""
-    now = flatten(json.loads(json.dumps(to_dict(config))))
-    then = flatten(to_dict(TrainConfig())) | flatten(before)
-    for name, value in now.items():
-        if name.split(".")[0] not in FREE_ON_RESUME and value != then.get(name):
-            raise ConfigError(f"{name} = {value!r}: should be {then.get(name)!r}, as when {run_dir} was started")
-
-
-def _finished_episodes(log: EpisodeLog) -> list[list[float]]:
-    """(outcome, return, decisions) of the episodes that ended, in the order of time."""
-    outcome, returns, lengths = jax.device_get((log.outcome, log.episode_return, log.num_decisions))
-    ended = np.nonzero(outcome != Outcome.RUNNING)
-    return [[int(outcome[i]), float(returns[i]), int(lengths[i])] for i in zip(*ended, strict=True)]
-
-
-def _row(metrics: dict[str, Any], log: EpisodeLog, recent) -> dict[str, float]:
-    """What one update has to say, by the names that the log file uses."""
-    row = {f"ppo/{name}": float(value) for name, value in metrics.items()}
-    for name in ("progress", "collision", "fall", "timeout"):
-        row[f"reward/{name}"] = float(np.mean(jax.device_get(getattr(log.terms, name))))
-    if recent:
-        episodes = np.array(recent)
-        for kind in OUTCOMES:
-            row[f"episode/{kind.name.lower()}"] = float(np.mean(episodes[:, 0] == kind))
-        row["episode/return"] = float(np.mean(episodes[:, 1]))
-        row["episode/decisions"] = float(np.mean(episodes[:, 2]))
-    return row
+def _median(rows: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Over the runs, of every number that all have."""
+    if len(rows) == 1:
+        return rows[0]
+    names = set.intersection(*(set(row) for row in rows))
+    return {name: float(np.median([row[name] for row in rows])) for name in names}

@@ -8,7 +8,7 @@ import pytest
 
 from segvisrl_jax.config import ConfigError, TrainConfig, from_dict, preset_config, replace_fields
 from segvisrl_jax.report.recipe import recipe
-from segvisrl_jax.training import loop
+from segvisrl_jax.training import loop, run
 from segvisrl_jax.training.loggers import is_being_written, read_metrics
 from segvisrl_jax.training.metrics import MetricsWriter
 from segvisrl_jax.training.trackers import IDS_FILE, open_trackers, require_installed
@@ -57,7 +57,7 @@ def test_a_tracker_that_fails_is_named_once_and_dropped(tmp_path):
 
 def test_a_failing_tracker_does_not_stop_a_training(tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "require_installed", lambda names: None)
-    monkeypatch.setattr(loop, "open_trackers", lambda config, run_dir: {"mlflow": Failing()})
+    monkeypatch.setattr(run, "open_trackers", lambda config, run_dir: {"mlflow": Failing()})
     said = []
     assert loop.train(tiny(tmp_path, loggers=("mlflow",)), say=said.append).finished
     assert len(said) == 1
@@ -77,7 +77,7 @@ def test_what_cannot_be_opened_is_refused_and_leaves_no_folder(tmp_path, monkeyp
         raise ConfigError("loggers = 'wandb': cannot be opened (no account); leave it out, or mend it")
 
     monkeypatch.setattr(loop, "require_installed", lambda names: None)
-    monkeypatch.setattr(loop, "open_trackers", no_account)
+    monkeypatch.setattr(run, "open_trackers", no_account)
     with pytest.raises(ConfigError, match="no account"):
         loop.train(tiny(tmp_path, loggers=("wandb",)))
     assert list(tmp_path.iterdir()) == []
@@ -93,13 +93,13 @@ def test_loggers_are_checked(loggers, says):
 
 def test_a_run_may_go_on_with_other_loggers_and_from_before_there_were_any(tmp_path):
     config = tiny(tmp_path)
-    file = loop.open_run_dir(config) / "config.json"
+    file = run.open_run_dir(config) / "config.json"
     (tmp_path / "run" / "checkpoints").mkdir()
     settings = json.loads(file.read_text())
     assert settings.pop("loggers") == []
     for before in (settings, {**settings, "loggers": ["wandb"]}):
         file.write_text(json.dumps(before))
-        loop.open_run_dir(replace_fields(config, resume=True, loggers=("mlflow",)))
+        run.open_run_dir(replace_fields(config, resume=True, loggers=("mlflow",)))
         assert from_dict(TrainConfig, before).loggers == tuple(before.get("loggers", ()))
     assert recipe(config) == recipe(replace_fields(config, loggers=("mlflow",)))
 
