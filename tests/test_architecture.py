@@ -20,7 +20,7 @@ MAY_IMPORT = {  # part -> the parts it may import, besides itself
     "adapters": {"config", "types", "env", "report"},
     "export": {"config", "env", "vision", "training", "agent", "report"},
     "sweep": {"config", "training"},
-    "machine": {"config", "env", "vision", "training", "adapters"},
+    "machine": {"config", "env", "vision", "agent", "training", "adapters"},
     "view": {"config", "types", "env", "vision", "training", "report"},
     "commands": {
         "assets",

@@ -179,13 +179,13 @@ class Learner:
         self, pool: ThreadPoolExecutor, params: Params, batch: Batch, envs: Int32[np.ndarray, " chunk"]
     ) -> Total:
         """``_chunk_total``, by every core of the pool."""
-        part, pieces = self._cut(batch, envs)
-        maps, pullbacks = zip(*pool.map(functools.partial(self._look, params), pieces), strict=True)
-        gradient, terms, cotangents = self._loss_gradient(params, maps, part)
-        return self._add(gradient, tuple(pool.map(self._pull_back, pullbacks, cotangents))), terms
+        part, pieces = self.cut(batch, envs)
+        maps, pullbacks = zip(*pool.map(functools.partial(self.look, params), pieces), strict=True)
+        gradient, terms, cotangents = self.loss_gradient(params, maps, part)
+        return self._add(gradient, tuple(pool.map(self.pull_back, pullbacks, cotangents))), terms
 
     @functools.partial(jax.jit, static_argnums=0)
-    def _cut(self, batch: Batch, envs: Int32[Array, " chunk"]) -> tuple[Batch, list[Any]]:
+    def cut(self, batch: Batch, envs: Int32[Array, " chunk"]) -> tuple[Batch, list[Any]]:
         """A few environments without their observations, and these as pieces of (n, 1, ...)."""
         part = take_environments(batch, envs)
         num_images = self.config.unroll_length * self.chunk
@@ -196,19 +196,19 @@ class Learner:
         pieces = [jax.tree.unflatten(structure, few) for few in zip(*split, strict=True)]
         return dataclasses.replace(part, observation=()), pieces
 
-    def _look(self, params: Params, piece: Any) -> tuple[Float32[Array, "n 1 M"], Pullback]:
+    def look(self, params: Params, piece: Any) -> tuple[Float32[Array, "n 1 M"], Pullback]:
+        """The maps of a piece, and what turns their gradient into that of the parameters; for one core."""
         return jax.block_until_ready(self._look_at(params, piece))
 
     @functools.partial(jax.jit, static_argnums=0)
     def _look_at(self, params: Params, piece: Any) -> tuple[Float32[Array, "n 1 M"], Pullback]:
-        """The maps of a piece, and what turns their gradient into that of the parameters."""
         observation = piece if self.draw is None else self.draw(piece)
         keep = jax.checkpoint_policies.save_only_these_names(CONVOLVED)
         maps = jax.checkpoint(lambda params: self.network.maps(params, observation), policy=keep, prevent_cse=False)
         return jax.vjp(maps, params)
 
     @functools.partial(jax.jit, static_argnums=0)
-    def _loss_gradient(
+    def loss_gradient(
         self, params: Params, maps: Sequence[Float32[Array, "n 1 M"]], part: Batch
     ) -> tuple[Params, LossTerms, list[Float32[Array, "n 1 M"]]]:
         """The gradient by the parameters behind the maps, the loss terms, the gradient by the maps."""
@@ -217,7 +217,8 @@ class Learner:
         (_, terms), (gradient, by_maps) = gradient_of(params, whole, part, self.network, self.config)
         return gradient, terms, jnp.split(by_maps.reshape((-1, 1, by_maps.shape[-1])), len(maps))
 
-    def _pull_back(self, pullback: Pullback, cotangent: Float32[Array, "n 1 M"]) -> Params:
+    def pull_back(self, pullback: Pullback, cotangent: Float32[Array, "n 1 M"]) -> Params:
+        """The gradient of the parameters that made the maps of a piece; for one core."""
         return jax.block_until_ready(self._pulled_back(pullback, cotangent))
 
     @functools.partial(jax.jit, static_argnums=0)

@@ -23,7 +23,8 @@ from segvisrl_jax.config import (
     require,
 )
 
-Part = Literal["physics", "render", "train", "start", "peers"]
+Part = Literal["physics", "render", "policy", "update", "train", "start", "peers"]
+FEW = {"num_envs": 8, "num_minibatches": 2}  # on a CPU, for the update: minibatches as large as the preset's
 PlainRenderer = Literal["scanline", "gl", "warp", "mujoco.Renderer"]
 """The project's renderers, and MuJoCo's Python class as one would use it without this project."""
 
@@ -33,14 +34,15 @@ class BenchOptions:
     """Times parts of the pipeline: medians of repeats, compilation apart. Prints tables; JSON where asked."""
 
     parts: tyro.conf.Positional[tuple[Part, ...]] = ("physics", "render", "train")
-    """physics, render, train; these three where none is named. start: what comes before a training's first update.
+    """physics, render, train; these three where none is named. policy, update: the network's decisions and learning, as
+    shares of what the machine does in a large matrix product. start: what comes before a training's first update.
     peers: PyTorch and sb3-contrib beside this project (needs the extra [sb3])."""
     batch: int = 32
     """Environments at once, for physics."""
     batches: tuple[int, ...] = (1, 16, 64, 256)
     """Frames at once, for the renderers."""
     scale: float = 10.0
-    """Downsampling of the 1920 x 1080 image, for the renderers (paper: 10)."""
+    """Downsampling of the 1920 x 1080 image, for the renderers, policy and update (paper: 10)."""
     num_rocks: tuple[int, ...] = (4,)
     """Rocks in the renderers' scenes."""
     repeats: int = 5
@@ -63,7 +65,15 @@ class BenchOptions:
 def run(options: Sequence[str]) -> int:
     """Parses, measures, prints a table for each part; writes JSON where asked."""
     asked = parse(BenchOptions, options, "bench")
-    measure = {"physics": _physics, "render": _render, "train": _train, "start": _start, "peers": _peers}
+    measure = {
+        "physics": _physics,
+        "render": _render,
+        "policy": _policy,
+        "update": _update,
+        "train": _train,
+        "start": _start,
+        "peers": _peers,
+    }
     before = machine()
     rows: list[dict[str, Any]] = []
     for part in asked.parts:
@@ -172,6 +182,32 @@ def _mujoco_look(config: EnvConfig) -> Callable[[Any], Any] | None:
         return images
 
     return look
+
+
+def _policy(asked: BenchOptions):
+    """The network alone, beside a matrix product in the same run."""
+    from segvisrl_jax.machine.limits import matrix_flop_per_s
+    from segvisrl_jax.machine.speed import policy_rows
+
+    limit = matrix_flop_per_s(asked.repeats)
+    yield {"name": "matrix product", "gflop_per_s": limit / 1e9}
+    config = replace_fields(preset_config(asked.arch, asked.preset), scale=asked.scale)
+    yield from policy_rows(config, asked.repeats, limit)
+
+
+def _update(asked: BenchOptions):
+    """Learning alone and its parts, beside a matrix product in the same run."""
+    import jax
+
+    from segvisrl_jax.machine.limits import matrix_flop_per_s
+    from segvisrl_jax.machine.speed import update_rows
+
+    limit = matrix_flop_per_s(asked.repeats)
+    yield {"name": "matrix product", "gflop_per_s": limit / 1e9}
+    config = replace_fields(preset_config(asked.arch, asked.preset), num_epochs=1, scale=asked.scale)
+    if jax.default_backend() == "cpu":
+        config = replace_fields(config, **FEW)
+    yield from update_rows(config, asked.repeats, limit)
 
 
 def _train(asked: BenchOptions):

@@ -132,6 +132,26 @@ def test_demo_writes_a_gif_of_the_shipped_policy_where_asked(tmp_path):
     assert (tmp_path / "demo.gif").read_bytes().startswith(b"GIF8")
 
 
+@pytest.mark.slow
+def test_bench_says_how_much_of_the_machine_learning_uses(tmp_path):
+    words = ["--scale", "120", "--repeats", "1", "--preset", "smoke", "--json", "b.json"]
+    done = segvisrl("bench", "policy", "update", *words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    limits, policy, update = [], [], []
+    for row in json.loads((tmp_path / "b.json").read_text())["rows"]:
+        is_limit = row["name"] == "matrix product"
+        (limits if is_limit else policy if row["part"] == "policy" else update).append(row)
+    assert [row["batch"] for row in policy] == [1, 4]
+    parts = ["convolutions, forward", "memory, heads, loss", "convolutions, backward"]
+    assert [row["phase"] for row in update] == ["all", *parts]
+    for row in policy + update:
+        assert 0 < row["percent_of_matrix_product"] < 100
+    whole, forward, _, backward = update
+    assert 3 * forward["mflop_each"] < whole["mflop_each"]
+    assert backward["mflop_each"] == 2 * forward["mflop_each"]
+    assert len(limits) == 2
+
+
 def test_bench_prints_a_table_and_writes_the_same_numbers(tmp_path):
     words = [
         "bench",
