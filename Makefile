@@ -11,6 +11,10 @@ RUN ?=
 ARGS ?=
 EPISODES ?= 1000
 WORKERS ?= 2
+BENCH_DIR ?= docs/benchmarks
+GPU_PRESET ?= gpu
+GPU_BATCH ?= 4096
+GPU_FRAMES ?= 64 512
 NOTEBOOKS ?= quickstart bearings curves downsampling failures learning_curves trajectories
 
 BIN := $(VENV)/bin
@@ -22,7 +26,7 @@ unexport JAX_PLATFORMS
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help setup extras sb3 train eval baselines demo sweep bench table test test-fast check format docs docs-serve notebooks lock clean
+.PHONY: help setup extras sb3 train eval baselines demo sweep bench bench-gpu table test test-fast check format docs docs-serve notebooks lock clean
 
 help: ## this list
 	@echo "usage: make TARGET [ARCH=cnn_lstm|cnn|cnn_lstm_raw|mlp|mlp_rocks] [PRESET=auto|cpu|gpu|paper|smoke] [STEPS=] [SEED=] [RUN=] [ARGS=]"
@@ -58,6 +62,11 @@ eval: $(READY) ## drive EPISODES held-out scenes with runs/RUN, or POLICY=name
 baselines: $(READY) ## the P controller and the random one on 10,000 scenes
 	@$(BIN)/segvisrl eval --controller p --episodes 10000 --seed $(SEED) $(ARGS)
 	@$(BIN)/segvisrl eval --controller random --episodes 10000 --seed $(SEED) $(ARGS)
+
+bench-gpu: $(READY) ## measure all parts with the gpu preset, in less than ten minutes: BENCH_DIR/*_gpu.json
+	@for part in "physics --engines mjx --batch $(GPU_BATCH)" "render --renderers scanline --batches $(GPU_FRAMES)" \
+	    "policy --preset $(GPU_PRESET)" "update --preset $(GPU_PRESET)" "train --preset $(GPU_PRESET)"; do \
+	  $(BIN)/segvisrl bench $$part --repeats 3 --json $(BENCH_DIR)/$${part%% *}_gpu.json $(ARGS) || exit 1; done
 
 table: $(READY) ## the evaluations in docs/results side by side: docs/results_table.md
 	@$(BIN)/segvisrl table docs/results --output docs/results_table.md $(ARGS)

@@ -79,7 +79,6 @@ class Trainer:
         self._unroll = self.devices.share(jax.jit(self._unroll_batch), (EVERYWHERE, ACTOR), acted)
         given = (EVERYWHERE, TRAJECTORY, BY_ENV, EVERYWHERE)
         self._learn = self.devices.share(self.learner.update, given, (EVERYWHERE, EVERYWHERE))
-
         if config.num_seeds > 1:
             self._train_seeds_together()
 
@@ -228,7 +227,7 @@ class _Session:
                 display.update(self._decisions, _median(rows))
                 if self._updates % config.checkpoint_every_updates == 0:
                     self._save(state)
-        self._save(state)
+            self._save(state)
         return self._updates >= config.num_updates
 
     def _start(self, first_params: Params | None) -> TrainingState:
