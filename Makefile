@@ -64,9 +64,10 @@ baselines: $(READY) ## the P controller and the random one on 10,000 scenes
 	@$(BIN)/segvisrl eval --controller random --episodes 10000 --seed $(SEED) $(ARGS)
 
 bench-gpu: $(READY) ## measure all parts with the gpu preset, in less than ten minutes: BENCH_DIR/*_gpu.json
-	@for part in "physics --engines mjx --batch $(GPU_BATCH)" "render --renderers scanline --batches $(GPU_FRAMES)" \
-	    "policy --preset $(GPU_PRESET)" "update --preset $(GPU_PRESET)" "train --preset $(GPU_PRESET)"; do \
-	  $(BIN)/segvisrl bench $$part --repeats 3 --json $(BENCH_DIR)/$${part%% *}_gpu.json $(ARGS) || exit 1; done
+	@$(BIN)/segvisrl bench physics --engines mjx --batch $(GPU_BATCH) --repeats 3 --json $(BENCH_DIR)/physics_gpu.json $(ARGS)
+	@$(BIN)/segvisrl bench render --renderers scanline --batches $(GPU_FRAMES) --repeats 3 --json $(BENCH_DIR)/render_gpu.json $(ARGS)
+	@$(BIN)/segvisrl bench policy update --preset $(GPU_PRESET) --repeats 3 --json $(BENCH_DIR)/update_gpu.json $(ARGS)
+	@$(BIN)/segvisrl bench train --preset $(GPU_PRESET) --repeats 3 --json $(BENCH_DIR)/train_gpu.json $(ARGS)
 
 table: $(READY) ## the evaluations in docs/results side by side: docs/results_table.md
 	@$(BIN)/segvisrl table docs/results --output docs/results_table.md $(ARGS)

@@ -41,8 +41,8 @@ def run(options: Sequence[str]) -> int:
         raise ConfigError('viser is not installed; pip install "segvisrl_jax[view]" installs it')
     require_free_port(asked.host, asked.port)
     viewer = open_viewer(asked)
-    print(f"http://{asked.host}:{viewer.server.get_port()}  (Ctrl-C ends)", flush=True)
     try:
+        print(f"http://{asked.host}:{viewer.server.get_port()}  (Ctrl-C ends)", flush=True)
         viewer.run(threading.Event())
     except KeyboardInterrupt:
         print()
