@@ -25,7 +25,7 @@ from segvisrl_jax.training.metrics import ProgressDisplay
 from segvisrl_jax.training.policy import Policy, network_policy
 from segvisrl_jax.training.processes import Processes, join
 from segvisrl_jax.training.rollout import ActorState, EpisodeLog, start_acting, unroll
-from segvisrl_jax.training.run import Run, open_run_dirs
+from segvisrl_jax.training.run import Run, open_run_dirs, open_runs
 from segvisrl_jax.training.stop_signals import StopSignals
 from segvisrl_jax.training.trackers import require_installed
 
@@ -168,10 +168,9 @@ def train(config: TrainConfig, say=print) -> TrainResult:
     require_installed(config.loggers)
     processes.on_first(lambda: open_run_dirs(config))
     with contextlib.ExitStack() as stack:
-        runs = []
-        for each in config.runs:
-            runs.append(Run(each, processes, say if processes.is_first else _say_nothing))
-            stack.callback(runs[-1].close)
+        runs = open_runs(config, processes, say if processes.is_first else _say_nothing)
+        for run in runs:
+            stack.callback(run.close)
         try:
             finished = _Session(Trainer(config), runs, processes).drive(first_params)
         except jax.errors.JaxRuntimeError as error:

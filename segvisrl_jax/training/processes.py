@@ -62,7 +62,7 @@ class Processes:
     def give_up(self, error: Exception, how_to_go_on: str) -> NoReturn:
         """Ends this process at once, where another one is gone: nothing that waits for all of them ends any more."""
         reason = str(error).strip().splitlines()[0][:200]
-        print(f"segvisrl train: another process of this run is gone ({reason})\n{how_to_go_on}", file=sys.stderr)
+        print(f"segvisrl train: this or another process of the run failed ({reason})\n{how_to_go_on}", file=sys.stderr)
         sys.stderr.flush()
         sys.stdout.flush()
         os._exit(LOST)

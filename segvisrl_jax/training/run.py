@@ -15,7 +15,6 @@ import numpy as np
 from segvisrl_jax.agent.networks import Params
 from segvisrl_jax.config import ConfigError, TrainConfig, flatten, to_dict
 from segvisrl_jax.training.checkpoint import Checkpoints, save_policy
-from segvisrl_jax.training.loggers import Logger
 from segvisrl_jax.training.metrics import MetricsWriter
 from segvisrl_jax.training.processes import Processes
 from segvisrl_jax.training.rollout import EpisodeLog
@@ -57,7 +56,7 @@ class Run:
         with contextlib.ExitStack() as stack:
             self._writer = None
             if self._is_first:
-                trackers = _open_trackers(config, self.folder)
+                trackers = open_trackers(config, self.folder)
                 self._writer = stack.enter_context(MetricsWriter(self.folder, trackers=trackers, say=say))
             self._checkpoints = Checkpoints(self.folder)
             stack.callback(self._checkpoints.close)
@@ -137,6 +136,26 @@ def open_run_dirs(config: TrainConfig) -> None:
         raise
 
 
+def open_runs(config: TrainConfig, processes: Processes, say: Callable[[str], None]) -> list[Run]:
+    """The run of every seed; where a logger fails, new runs leave no folders behind that would be in the way.
+
+    Raises:
+        ConfigError: where a logger cannot be opened.
+    """
+    opened: list[Run] = []
+    try:
+        for settings in config.runs:
+            opened.append(Run(settings, processes, say))
+    except ConfigError:
+        for run in opened:
+            run.close()
+        if not config.resume:
+            for settings in config.runs:
+                shutil.rmtree(Path(settings.runs_dir) / settings.run_name)
+        raise
+    return opened
+
+
 def open_run_dir(config: TrainConfig) -> Path:
     """Makes the run's folder and writes the resolved config, or checks that it can be resumed.
 
@@ -185,13 +204,3 @@ def _row(metrics: dict[str, Any], log: EpisodeLog, recent) -> dict[str, float]:
         row["episode/return"] = float(np.mean(episodes[:, 1]))
         row["episode/decisions"] = float(np.mean(episodes[:, 2]))
     return row
-
-
-def _open_trackers(config: TrainConfig, run_dir: Path) -> dict[str, Logger]:
-    """What the settings name; where that fails, a new run leaves no folder behind that would be in the way."""
-    try:
-        return open_trackers(config, run_dir)
-    except ConfigError:
-        if not config.resume:
-            shutil.rmtree(run_dir)
-        raise

@@ -79,6 +79,18 @@ def test_one_folder_in_the_way_and_no_run_is_begun(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["pair-seed1"]
 
 
+def test_a_logger_that_fails_leaves_no_folder_of_any_seed(tmp_path, monkeypatch):
+    def refuse(config, folder):
+        if config.seed == 1:
+            raise ConfigError("loggers = wandb: should be one that opens")
+        return {}
+
+    monkeypatch.setattr("segvisrl_jax.training.run.open_trackers", refuse)
+    with pytest.raises(ConfigError, match="one that opens"):
+        loop.train(settings("mlp", num_seeds=3, run="trio", runs_dir=str(tmp_path)), **QUIET)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_runs_are_named_after_their_seeds():
     runs = TrainConfig(num_seeds=2, seed=3).runs
     assert [(run.run_name, run.seed, run.num_seeds) for run in runs] == [
