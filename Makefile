@@ -26,7 +26,7 @@ unexport JAX_PLATFORMS
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help setup extras sb3 train eval baselines demo sweep bench bench-gpu table test test-fast check format docs docs-serve notebooks lock clean
+.PHONY: help setup extras sb3 train eval baselines demo sweep bench bench-gpu table test test-fast test-docs check format docs docs-serve notebooks lock clean
 
 help: ## this list
 	@echo "usage: make TARGET [ARCH=cnn_lstm|cnn|cnn_lstm_raw|mlp|mlp_rocks] [PRESET=auto|cpu|gpu|paper|smoke] [STEPS=] [SEED=] [RUN=] [ARGS=]"
@@ -86,6 +86,9 @@ test: $(READY) ## the whole suite, on the CPU, in WORKERS processes
 
 test-fast: $(READY) ## the edit loop: everything but the slow tests
 	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow" $(ARGS)
+
+test-docs: $(EXTRAS_READY) ## run every command of the README and the documentation, at a tiny size (an hour)
+	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -q -n $(WORKERS) tests/docs_commands.py $(ARGS)
 
 check: $(READY) ## format, lint, types, fast tests (TESTED=1: without the tests)
 	@$(BIN)/ruff format --check .
