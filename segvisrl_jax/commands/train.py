@@ -2,6 +2,8 @@
 
 import json
 import math
+import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,8 @@ from segvisrl_jax.config import (
     to_dict,
 )
 
+FAILED = 1
+SHOW_CURSOR = "\x1b[?25h"
 TEST_EPISODES = 200  # driven after training, on scenes that neither training nor the choice of the policy saw
 
 
@@ -27,18 +31,25 @@ def run(options: Sequence[str]) -> int:
     """Parses, trains, evaluates, draws."""
     config = parse_config(options)
 
-    from segvisrl_jax.training.loop import train
+    from segvisrl_jax.training.loop import DivergedError, train
 
     is_first = config.process_id == 0
     if not config.resume and is_first:
         print(differences_from_paper(config))
         print(observation_memory(config))
-    result = train(config)
-    if not is_first:
-        return 0 if result.finished else INTERRUPTED
     resume = f"segvisrl train --resume --runs-dir {config.runs_dir} --run {config.run_name}"
     if config.num_seeds > 1:
         resume += f" --seed {config.seed} --num-seeds {config.num_seeds}"
+    try:
+        result = train(config, when_late=lambda said: _end_now(f"{said} Go on with:\n  {resume}"))
+    except DivergedError as error:
+        print(f"segvisrl train: {error}", file=sys.stderr)
+        return FAILED
+    if not is_first:
+        return 0 if result.finished else INTERRUPTED
+    if result.not_on_disk:
+        print(f"segvisrl train: could not be written: {'; '.join(result.not_on_disk)}", file=sys.stderr)
+        return FAILED
     if not result.finished:
         print(f"Stopped and saved after {result.decisions:,} decisions. Go on with:\n  {resume}")
         return INTERRUPTED
@@ -47,6 +58,13 @@ def run(options: Sequence[str]) -> int:
     if config.num_seeds > 1:
         print(f"All seeds: {_draw_together(config, result.run_dirs)}")
     return 0
+
+
+def _end_now(said: str) -> None:
+    """Ends the process from whichever thread, whatever the others do; the terminal gets its cursor back."""
+    sys.stdout.write((SHOW_CURSOR if sys.stdout.isatty() else "") + f"\n{said}\n")
+    sys.stdout.flush()
+    os._exit(INTERRUPTED)
 
 
 def parse_config(options: Sequence[str]) -> TrainConfig:
@@ -111,7 +129,7 @@ def differences_from_paper(config: TrainConfig) -> str:
     paper = flatten(to_dict(preset_config(config.arch, "paper")))
     ours = flatten(to_dict(config))
     bookkeeping = (
-        "seed", "run", "runs_dir", "resume", "preset", "checkpoint_every_updates", "loggers",
+        "seed", "run", "runs_dir", "resume", "preset", "checkpoint_every_updates", "max_bad_updates", "loggers",
         "num_seeds", "num_devices", "coordinator", "num_processes", "process_id",
     )  # fmt: skip
     rows = [

@@ -166,6 +166,8 @@ class TrainConfig:
     process_id: int = 0
     """Which of them this is, from 0."""
     checkpoint_every_updates: int = 8
+    max_bad_updates: int = 10
+    """Updates in a row with a loss or gradient that is not finite (such steps are skipped), after which a run stops."""
     loggers: tuple[LoggerName, ...] = ()
     """wandb, mlflow: who gets the numbers besides metrics.jsonl and TensorBoard. Offline, unless WANDB_MODE or
     MLFLOW_TRACKING_URI say otherwise; each is an extra of the package."""
@@ -207,6 +209,7 @@ class TrainConfig:
             "num_processes",
             "process_id",
             "checkpoint_every_updates",
+            "max_bad_updates",
         ):
             value = getattr(self, name)
             require(type(value) is int, name, value, "a whole number")
@@ -216,6 +219,7 @@ class TrainConfig:
         require(
             self.checkpoint_every_updates >= 1, "checkpoint_every_updates", self.checkpoint_every_updates, "1 or more"
         )
+        require(self.max_bad_updates >= 1, "max_bad_updates", self.max_bad_updates, "1 or more")
         self._require_even_shares()
         is_plain = (
             isinstance(self.run, str) and "/" not in self.run and self.run not in (".", "..") and "\0" not in self.run

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from segvisrl_jax.training.loggers import METRICS_FILE, STEP_KEY, is_being_written, read_metrics
+from segvisrl_jax.training.loggers import METRICS_FILE, STEP_KEY, read_metrics
+from segvisrl_jax.training.run_lock import is_being_trained
 
 State = Literal["finished", "running", "stopped"]
 CONFIG_FILE, TEST_FILE = "config.json", "eval.json"
@@ -154,12 +155,12 @@ def _metrics(path: Path) -> list[dict[str, Any]]:
 
 
 def _state(path: Path, rows: list[dict[str, Any]], done: int, asked: int, per_update: int, changed_s: float) -> State:
-    """Running: a process of this machine holds the metrics file, or its last line is fresh and no end has been saved.
+    """Running: a process of this machine holds its folder, or its last line is fresh and no end has been saved.
 
     The second is for runs on another machine whose folder is shared. A run that ends early saves a checkpoint behind
     its last line, and so cannot be taken for a running one.
     """
-    if is_being_written(path):
+    if is_being_trained(path):
         return "running"
     if done >= asked:
         return "finished"
