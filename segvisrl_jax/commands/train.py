@@ -1,5 +1,6 @@
 """``segvisrl train``: one training run and everything that it leaves behind."""
 
+import contextlib
 import json
 import math
 from collections.abc import Sequence
@@ -33,7 +34,8 @@ def run(options: Sequence[str]) -> int:
     if not config.resume and is_first:
         print(differences_from_paper(config))
         print(observation_memory(config))
-    result = train(config)
+    with _told_where_memory_ends(config):
+        result = train(config)
     if not is_first:
         return 0 if result.finished else INTERRUPTED
     resume = f"segvisrl train --resume --runs-dir {config.runs_dir} --run {config.run_name}"
@@ -135,6 +137,23 @@ def observation_memory(config: TrainConfig) -> str:
     if config.ppo.redraw_observations:
         return f"  observations: {total:,.1f} MB a batch, drawn again when needed (not stored)"
     return f"  observations: {total:,.1f} MB a batch, stored"
+
+
+def _told_where_memory_ends(config: TrainConfig) -> contextlib.AbstractContextManager[None]:
+    """Warns where memory will not be enough, and says in one line what to do where it was not.
+
+    Of several processes, none is to ask JAX before they have met, and training itself ends all where one fails.
+    """
+    from segvisrl_jax.machine import memory
+
+    if config.num_processes > 1:
+        return contextlib.nullcontext()
+    on_cpu = preset_for_this_machine() == "cpu"
+    need, (all_bytes, free_bytes) = memory.need_of(config, on_cpu), memory.there_is(on_cpu)
+    warning = memory.warning(config, need, free_bytes)
+    if warning:
+        print(warning)
+    return memory.one_line_where_memory_ends(memory.last_words(config, need, all_bytes, on_cpu))
 
 
 def _short(value: Any) -> str:
