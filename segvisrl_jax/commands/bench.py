@@ -39,7 +39,7 @@ class BenchOptions:
     """physics, render, train; these three where none is named. policy, update: the network's decisions and learning, as
     shares of what the machine does in a large matrix product. start: what comes before a training's first update.
     peers: PyTorch and sb3-contrib beside this project (needs the extra [sb3]). growth: time and memory against rocks,
-    environments, image and unroll, one of them varied at a time; about 20 minutes."""
+    environments, image and unroll, one of them varied at a time; 20 to 25 minutes."""
     batch: int = 32
     """Environments at once, for physics."""
     batches: tuple[int, ...] = (1, 16, 64, 256)
