@@ -4,7 +4,6 @@ Every option comes from a dataclass (tyro). Nothing heavy is imported before it 
 """
 
 import contextlib
-import ctypes
 import importlib
 import io
 import os
@@ -14,6 +13,7 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from segvisrl_jax.config import ConfigError
+from segvisrl_jax.machine.memory import OutOfMemory, keep_freed_memory, one_line_where_memory_ends, what_there_is
 from segvisrl_jax.machine.programs import keep_compiled_programs
 
 COMMANDS = {
@@ -30,6 +30,11 @@ COMMANDS = {
     "doctor": "say whether this machine can do the work, how fast, and what to mend",
 }
 TIMED = ("bench",)  # compiles everything anew: it reports how long that takes
+SMALLER = {  # what makes a command take less memory; train says more
+    "eval": "--slots 32 drives fewer episodes at the same time",
+    "bench": "smaller --batch and --batches, or a larger --scale, take less",
+}
+FAILURE = 1
 USAGE_ERROR = 2
 INTERRUPTED = 130
 READER_GONE = 141  # what a shell gives for SIGPIPE: the output went to `head`, which had enough
@@ -51,37 +56,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     if command not in COMMANDS:
         print(f"segvisrl: {command!r} is not a command; there are: {', '.join(COMMANDS)}", file=sys.stderr)
         return USAGE_ERROR
-    _keep_freed_memory()
+    keep_freed_memory()
     if command not in TIMED:
         keep_compiled_programs()
     try:
         module = importlib.import_module(f"segvisrl_jax.commands.{command}")
-        code = module.run(options)
+        with one_line_where_memory_ends(what_there_is(SMALLER.get(command, ""))):
+            code = module.run(options)
         sys.stdout.flush()
         return code
     except ConfigError as error:
         print(f"segvisrl {command}: {error}", file=sys.stderr)
         return USAGE_ERROR
+    except OutOfMemory as error:
+        print(f"segvisrl {command}: {error}", file=sys.stderr)
+        return FAILURE
     except KeyboardInterrupt:
         print(f"\nsegvisrl {command}: interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more when it ends
         return READER_GONE
-
-
-def _keep_freed_memory() -> None:
-    """Tells glibc to keep freed memory for the next allocation, where there is glibc.
-
-    XLA on a CPU allocates its buffers anew in every call. Those above 32 MiB come fresh from the kernel each time, page
-    by page, which costs a quarter of the gradient's time. See mallopt(3).
-    """
-    with contextlib.suppress(OSError, AttributeError):
-        mallopt = ctypes.CDLL("libc.so.6").mallopt
-        trim_threshold, mmap_max, arena_max = -1, -4, -8  # M_TRIM_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX of malloc.h
-        mallopt(trim_threshold, 2**31 - 1)
-        mallopt(mmap_max, 0)
-        mallopt(arena_max, 1)
 
 
 def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: OptionsT | None = None) -> OptionsT:

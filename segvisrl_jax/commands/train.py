@@ -1,5 +1,6 @@
 """``segvisrl train``: one training run and everything that it leaves behind."""
 
+import contextlib
 import json
 import math
 import os
@@ -41,7 +42,8 @@ def run(options: Sequence[str]) -> int:
     if config.num_seeds > 1:
         resume += f" --seed {config.seed} --num-seeds {config.num_seeds}"
     try:
-        result = train(config, when_late=lambda said: _end_now(f"{said} Go on with:\n  {resume}"))
+        with _told_where_memory_ends(config):
+            result = train(config, when_late=lambda said: _end_now(f"{said} Go on with:\n  {resume}"))
     except DivergedError as error:
         print(f"segvisrl train: {error}", file=sys.stderr)
         return FAILED
@@ -153,6 +155,23 @@ def observation_memory(config: TrainConfig) -> str:
     if config.ppo.redraw_observations:
         return f"  observations: {total:,.1f} MB a batch, drawn again when needed (not stored)"
     return f"  observations: {total:,.1f} MB a batch, stored"
+
+
+def _told_where_memory_ends(config: TrainConfig) -> contextlib.AbstractContextManager[None]:
+    """Warns where memory will not be enough, and says in one line what to do where it was not.
+
+    Of several processes, none is to ask JAX before they have met, and training itself ends all where one fails.
+    """
+    from segvisrl_jax.machine import memory
+
+    if config.num_processes > 1:
+        return contextlib.nullcontext()
+    on_cpu = preset_for_this_machine() == "cpu"
+    need, (all_bytes, free_bytes) = memory.need_of(config, on_cpu), memory.there_is(on_cpu)
+    warning = memory.warning(config, need, free_bytes)
+    if warning:
+        print(warning)
+    return memory.one_line_where_memory_ends(memory.last_words(config, need, all_bytes, on_cpu))
 
 
 def _short(value: Any) -> str:
