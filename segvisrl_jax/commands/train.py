@@ -38,12 +38,10 @@ def run(options: Sequence[str]) -> int:
     if not config.resume and is_first:
         print(differences_from_paper(config))
         print(observation_memory(config))
-    resume = f"segvisrl train --resume --runs-dir {config.runs_dir} --run {config.run_name}"
-    if config.num_seeds > 1:
-        resume += f" --seed {config.seed} --num-seeds {config.num_seeds}"
+    going_on = f"Go on with:\n  {_resuming(config)}"
     try:
         with _told_where_memory_ends(config):
-            result = train(config, when_late=lambda said: _end_now(f"{said} Go on with:\n  {resume}"))
+            result = train(config, when_late=lambda said: _end_now(f"{said} {going_on}"))
     except DivergedError as error:
         print(f"segvisrl train: {error}", file=sys.stderr)
         return FAILED
@@ -53,13 +51,19 @@ def run(options: Sequence[str]) -> int:
         print(f"segvisrl train: could not be written: {'; '.join(result.not_on_disk)}", file=sys.stderr)
         return FAILED
     if not result.finished:
-        print(f"Stopped and saved after {result.decisions:,} decisions. Go on with:\n  {resume}")
+        print(f"Stopped and saved after {result.decisions:,} decisions. {going_on}")
         return INTERRUPTED
     for each, run_dir in zip(config.runs, result.run_dirs, strict=True):
         _finish(each, run_dir)
     if config.num_seeds > 1:
         print(f"All seeds: {_draw_together(config, result.run_dirs)}")
     return 0
+
+
+def _resuming(config: TrainConfig) -> str:
+    """The command that goes on with a run, or with all seeds."""
+    resume = f"segvisrl train --resume --runs-dir {config.runs_dir} --run {config.run_name}"
+    return resume + (f" --seed {config.seed} --num-seeds {config.num_seeds}" if config.num_seeds > 1 else "")
 
 
 def _end_now(said: str) -> None:

@@ -46,6 +46,7 @@ class JsonLines:
     def __init__(self, run_dir: Path) -> None:
         self._path = Path(run_dir) / METRICS_FILE
         self._waiting: list[bytes] = []
+        self.num_dropped = 0  # lines that were damaged
         self._file = self._open(lambda row: True)
         self._size = self._path.stat().st_size  # of the whole lines in it
 
@@ -104,7 +105,7 @@ class JsonLines:
 
     def _open(self, is_kept: Callable[[dict[str, Any]], bool]) -> FileIO:
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        _rewrite(self._path, is_kept)
+        self.num_dropped += _rewrite(self._path, is_kept)
         self._path.touch()
         return self._path.open("r+b", buffering=0)
 
@@ -166,13 +167,14 @@ class TensorBoard:
 
 
 def read_metrics(run_dir: Path) -> list[dict[str, Any]]:
-    """The lines of a run's ``metrics.jsonl`` in order; without those that are cut off or damaged.
+    """The lines of a run's ``metrics.jsonl`` in order; without the last one where it is cut off.
 
     Raises:
         FileNotFoundError: where the run has none.
+        ValueError: where a whole line is no JSON.
     """
     with (Path(run_dir) / METRICS_FILE).open("rb") as file:
-        return [row for line in file if (row := _row(line)) is not None]
+        return [json.loads(line) for line in file if line.endswith(b"\n")]
 
 
 def one_line(error: BaseException) -> str:
@@ -190,12 +192,13 @@ def _row(line: bytes) -> dict[str, Any] | None:
     return row if is_whole else None
 
 
-def _rewrite(path: Path, is_kept: Callable[[dict[str, Any]], bool]) -> None:
-    """Keeps the whole lines for which ``is_kept(row)`` holds, in one move."""
+def _rewrite(path: Path, is_kept: Callable[[dict[str, Any]], bool]) -> int:
+    """Keeps the whole lines for which ``is_kept(row)`` holds, in one move; how many others were damaged."""
     if not path.exists():
-        return
+        return 0
     text = path.read_bytes()
     rows = [(line, _row(line)) for line in text.splitlines(keepends=True)]
     kept = b"".join(line for line, row in rows if row is not None and is_kept(row))
     if kept != text:
         replace_file(path, lambda file: file.write(kept))
+    return sum(row is None and line.endswith(b"\n") for line, row in rows)

@@ -84,6 +84,8 @@ class MetricsWriter:
             self._own[TENSORBOARD_FOLDER] = TensorBoard(run_dir)
         self._failing: set[str] = set()
         self._trackers, self._say = dict(trackers or {}), say
+        if self._lines.num_dropped:
+            say(f"warning: {METRICS_FILE}: {self._lines.num_dropped} damaged lines are left out")
 
     def resume_at(self, step: int) -> None:
         """Drops every line beyond ``step``, so that a run resumed there does not write them twice."""
