@@ -110,6 +110,7 @@ def test_a_disk_that_stays_full_keeps_the_last_checkpoint(disk, during, undistur
     assert result.finished
     assert any("the checkpoint of update 8" in what for what in result.not_on_disk), result.not_on_disk
     (disk / "filler").unlink()
+    during.clear()
     assert arrays(settings(disk))[0] == 4
     assert loop.train(settings(disk, resume=True), say=lambda line: None).not_on_disk == ()
     require_same_run(settings(disk), undisturbed)
