@@ -184,8 +184,10 @@ def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | N
         for run in runs:
             stack.callback(run.close)
         try:
-            session = _Session(Trainer(config), runs, processes)
-            finished = session.drive(first_params, when_late if processes.count == 1 else None)
+            session = _Session(config, runs, processes)
+            late = functools.partial(session.end_late, when_late) if when_late and processes.count == 1 else None
+            with StopSignals(late=late) as stop:
+                finished = session.drive(stop, first_params)
             missing = tuple(f"{run.folder}: {what}" for run in runs for what in run.not_on_disk())
         except jax.errors.JaxRuntimeError as error:
             if processes.count > 1:  # at once: closing would wait for those who are gone
@@ -201,7 +203,9 @@ def _say_nothing(line: str) -> None:
 
 
 def _params_to_start_from(config: TrainConfig) -> Params | None:
-    if not config.start_from:
+    folders = [Path(run.runs_dir) / run.run_name / "checkpoints" for run in config.runs]
+    has_begun = config.resume and all(any(folder.glob("[0-9]*")) for folder in folders)
+    if not config.start_from or has_begun:
         return None
     source, params, _ = load_policy(Path(config.start_from))
     for name, ours, theirs in (
@@ -213,30 +217,28 @@ def _params_to_start_from(config: TrainConfig) -> Params | None:
     return params
 
 
-@dataclasses.dataclass
 class _Session:
     """One sitting of the runs that a trainer trains."""
 
     trainer: Trainer
-    runs: Sequence[Run]
-    processes: Processes
 
-    def __post_init__(self) -> None:
+    def __init__(self, config: TrainConfig, runs: Sequence[Run], processes: Processes) -> None:
+        self.config, self.runs, self.processes = config, runs, processes
         self._saving = threading.Lock()
         self._whole: tuple[TrainingState, list[HostState]] | None = None  # after the last update that is written down
         self._bad_updates = 0  # in a row
 
-    def drive(self, first_params: Params | None, when_late: Callable[[str], object] | None = None) -> bool:
+    def drive(self, stop: StopSignals, first_params: Params | None) -> bool:
         """Updates until the end or a signal, and saves; whether it is the end."""
-        config = self.trainer.config
+        config = self.config
+        self.trainer = Trainer(config)
         state = self._start(first_params)
         for run in self.runs:
             run.begin()
         every = -(-config.evaluation.every_decisions // config.ppo.decisions_per_update)
         total = config.num_updates * config.ppo.decisions_per_update
         console = None if self.processes.is_first else Console(quiet=True)
-        late = functools.partial(self._end_late, when_late) if when_late else None
-        with StopSignals(late=late) as stop, ProgressDisplay(total, self._decisions, self._name, console) as display:
+        with ProgressDisplay(total, self._decisions, self._name, console) as display:
             while self._updates < config.num_updates and not self.processes.any(stop.requested):
                 self._whole = state, [run.snapshot() for run in self.runs]
                 state, rows = self._update(state)
@@ -253,9 +255,9 @@ class _Session:
 
     def _start(self, first_params: Params | None) -> TrainingState:
         begun = [run.num_saved is not None for run in self.runs]
-        going_on = self.trainer.config.resume and all(begun)
+        going_on = self.config.resume and all(begun)
         state = self.trainer.start(None if going_on else first_params)
-        if not self.trainer.config.resume:
+        if not self.config.resume:
             return state
         if not any(begun):
             self.runs[0].say("nothing was saved yet: starting at the beginning")
@@ -267,7 +269,7 @@ class _Session:
         require(same, "num_seeds", len(self.runs), f"1, for each run by itself: they have made {reached} updates")
         return self.trainer.of_seeds(restored)
 
-    def _end_late(self, end: Callable[[str], object], at_once: bool) -> None:
+    def end_late(self, end: Callable[[str], object], at_once: bool) -> None:
         """In the watching thread: saves the state before the update that takes too long, and ends the process."""
         with self._saving:
             if self._whole is not None and not at_once and not self._bad_updates:
@@ -275,7 +277,7 @@ class _Session:
                 for i, (run, host) in enumerate(zip(self.runs, hosts, strict=True)):
                     run.save(self.trainer.of_seed(state, i), host)
             saved = self.runs[0].num_saved
-            decisions = (saved or 0) * self.trainer.config.ppo.decisions_per_update
+            decisions = (saved or 0) * self.config.ppo.decisions_per_update
             end(f"Stopped at once; saved are {decisions:,} decisions." if saved else "Stopped before the first save.")
 
     def _require_finite(self, rows: Sequence[dict[str, float]]) -> None:
@@ -286,7 +288,7 @@ class _Session:
         """
         is_bad = any(row["ppo/skipped_steps"] > 0 for row in rows)
         self._bad_updates = self._bad_updates + 1 if is_bad else 0
-        if self._bad_updates < self.trainer.config.max_bad_updates:
+        if self._bad_updates < self.config.max_bad_updates:
             return
         saved = self.runs[0].num_saved
         kept = f"the checkpoint of update {saved} is from before" if saved else "nothing was saved before"
