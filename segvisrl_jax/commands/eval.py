@@ -9,7 +9,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 from segvisrl_jax.cli import parse
-from segvisrl_jax.config import ConfigError, EngineName, EnvConfig, RendererName, TrainConfig, require, to_dict
+from segvisrl_jax.config import (
+    ConfigError,
+    EngineName,
+    EnvConfig,
+    RendererName,
+    TrainConfig,
+    require,
+    require_file_can_be_written,
+    to_dict,
+)
 from segvisrl_jax.config.conditions import ConditionsConfig
 
 
@@ -46,8 +55,8 @@ class EvalOptions:
 def run(options: Sequence[str]) -> int:
     """Parses, drives, prints; writes JSON where asked."""
     asked = parse(EvalOptions, options, "eval")
-    if asked.json is not None and not asked.json.resolve().parent.is_dir():
-        raise ConfigError(f"--json = {str(asked.json)!r}: should be in a folder that exists")
+    if asked.json is not None:
+        require_file_can_be_written(asked.json, "--json")
     result = evaluate(asked)
     print(f"{result['method']}: {report_line(result)}")
     if asked.json is not None:
