@@ -27,7 +27,13 @@ def _scores(run_dir: Path) -> dict[str, float]:
         last = read_rows(run_dir)[-1]
         speed = last["step"] / last["time/seconds"]
         kept = {name: result[name] for name in SCORES if name in result}
-        scores = {**kept, "success_low": low, "success_high": high, "decisions_per_second": speed}
+        scores = {
+            "success": result["success"],
+            **kept,
+            "success_low": low,
+            "success_high": high,
+            "decisions_per_second": speed,
+        }
         for name, value in scores.items():
             require(is_finite(value), name, value, "a finite number")
     except (OSError, ValueError, KeyError, IndexError, TypeError, ArithmeticError) as error:

@@ -6,6 +6,7 @@ commands beside ``train``.
 
 import dataclasses
 import math
+import shutil
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -54,6 +55,7 @@ COMMAND_CASES: list[tuple[list[str], str, str]] = [  # words, the field that is 
     (["eval", "--policy", LONG_NAME], "", LONG_NAME),
     (["eval", "--policy", "damaged/card"], "policy.json", "config"),
     (["eval", "--policy", "damaged/arrays"], "params.npz", "cannot be read"),
+    (["eval", "--policy", "damaged/narrow"], "bias", "(256,)"),
     (["eval", "--run", "nowhere"], "--run", "nowhere"),
     (["eval", "--run", "file"], "--run", "file"),
     (["eval", "--run"], "--run", "nothing"),
@@ -167,7 +169,7 @@ def require_good_message(message: str, name: str, value: object) -> None:
         assert repr(value)[:20] in message or repr(one) in message
 
 
-@pytest.mark.parametrize("setting", settings_of(BASE), ids=lambda setting: setting.path)
+@pytest.mark.parametrize("setting", list(settings_of(BASE)), ids=lambda setting: setting.path)
 def test_a_field_refuses_what_it_cannot_be(setting):
     for value in wrong_values(setting):
         with pytest.raises(ConfigError) as refused:
@@ -175,7 +177,7 @@ def test_a_field_refuses_what_it_cannot_be(setting):
         require_good_message(str(refused.value), setting.name, value)
 
 
-@pytest.mark.parametrize("setting", settings_of(BASE), ids=lambda setting: setting.path)
+@pytest.mark.parametrize("setting", list(settings_of(BASE)), ids=lambda setting: setting.path)
 def test_stored_settings_are_refused_likewise(setting):
     *parts, name = setting.path.split(".")
     for value in wrong_values(setting):
@@ -244,10 +246,12 @@ def folder(tmp_path, monkeypatch) -> Path:
         (Path("damaged") / run / "config.json").write_text(text)
         (Path("damaged") / f"{run}.json").write_text(text)
     Path("damaged/empty.json").write_text("")
-    for policy, card in {"card": "{}", "arrays": (asset_dir("pretrained") / "mlp" / "policy.json").read_text()}.items():
-        (Path("damaged") / policy).mkdir()
+    shipped = asset_dir("pretrained") / "mlp"
+    sound = (shipped / "policy.json").read_text()
+    for policy, card in {"card": "{}", "arrays": sound, "narrow": sound.replace("256", "32")}.items():
+        shutil.copytree(shipped, Path("damaged") / policy)
         (Path("damaged") / policy / "policy.json").write_text(card)
-        (Path("damaged") / policy / "params.npz").write_text("no zip")
+    Path("damaged/arrays/params.npz").write_text("no zip")
     return tmp_path
 
 

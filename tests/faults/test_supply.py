@@ -16,11 +16,14 @@ import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import segvisrl_jax
+from segvisrl_jax.config import ConfigError
+from segvisrl_jax.training.checkpoint import load_policy
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = Path(segvisrl_jax.__file__).parent
@@ -284,6 +287,27 @@ def _unsafe_call(call: ast.Call) -> Iterator[str]:
         is_numpy = isinstance(call.func.value, ast.Name) and call.func.value.id in ("np", "numpy", "jnp")
         if is_numpy and "allow_pickle" not in keywords:
             yield "load without allow_pickle=False"
+
+
+class Trap:
+    """Pickled, it makes a file where it is unpickled."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_a_policy_with_a_pickle_inside_is_refused_and_not_unpickled(tmp_path):
+    shutil.copytree(ROOT / "pretrained" / "mlp", tmp_path / "policy")
+    sprung = tmp_path / "sprung"
+    np.savez(tmp_path / "policy" / "params.npz", a=np.array([Trap(sprung)], dtype=object))
+    with pytest.raises(ConfigError, match=r"params\.npz"):
+        load_policy(tmp_path / "policy")
+    assert not sprung.exists()
+    np.load(tmp_path / "policy" / "params.npz", allow_pickle=True)["a"]
+    assert sprung.exists()  # so the trap works
 
 
 @pytest.mark.parametrize(
