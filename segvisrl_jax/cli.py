@@ -4,6 +4,7 @@ Every option comes from a dataclass (tyro). Nothing heavy is imported before it 
 """
 
 import contextlib
+import errno
 import importlib
 import io
 import os
@@ -37,8 +38,19 @@ SMALLER = {  # what makes a command take less memory; train says more
 FAILURE = 1
 USAGE_ERROR = 2
 INTERRUPTED = 130
+BAD_PATH = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR, errno.EACCES)
 READER_GONE = 141  # what a shell gives for SIGPIPE: the output went to `head`, which had enough
 OptionsT = TypeVar("OptionsT")
+COMPLAINTS = {
+    r"Error parsing (?P<option>-\S+): invalid literal for int\(\) with base 10: (?P<value>.*)": "a whole number",
+    r"Error parsing (?P<option>-\S+): could not convert string to float: (?P<value>.*)": "a number",
+    r"Error parsing (?P<option>-\S+): Could not find valid parse for arguments: (?P<value>.*)": "whole numbers",
+    r"Error parsing (?P<option>-\S+): no type matching \{None\}\|INT could be instantiated from "
+    r"\[(?P<value>.*?)\]\. Got errors: .*": "a whole number, or None",
+    r"invalid choice (?P<value>.*) for argument '(?P<option>.*)'\. Expected one of \((?P<choices>.*)\)\.": "one of ",
+    r"Missing value for argument '(?P<option>.*)'\. Expected \d+ values?\.": "followed by a value",
+}
+"""What tyro says of a value, and what would be right."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -66,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return code
     except ConfigError as error:
-        print(f"segvisrl {command}: {error}", file=sys.stderr)
+        _complain(command, str(error))
         return USAGE_ERROR
     except OutOfMemory as error:
         print(f"segvisrl {command}: {error}", file=sys.stderr)
@@ -77,6 +89,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more when it ends
         return READER_GONE
+    except OSError as error:
+        if error.errno not in BAD_PATH or error.filename is None:
+            raise
+        _complain(command, f"{os.fsdecode(error.filename)!r}: should be a path that can be used ({error.strerror})")
+        return USAGE_ERROR
+
+
+def _complain(command: str, what: str) -> None:
+    """One line, whatever a name or a value has in it."""
+    print(f"segvisrl {command}: {' '.join(what.splitlines())}", file=sys.stderr)
 
 
 def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: OptionsT | None = None) -> OptionsT:
@@ -98,7 +120,7 @@ def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: O
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise _config_error(stop) or ConfigError(_one_line(said.getvalue())) from None
+        raise _config_error(stop) or ConfigError(_in_our_words(_one_line(said.getvalue()), words, command)) from None
 
 
 def _config_error(error: BaseException | None) -> ConfigError | None:
@@ -125,6 +147,31 @@ def _one_line(message: str) -> str:
         if line:
             paragraph.append(line)
     return " ".join(paragraph)
+
+
+def _in_our_words(complaint: str, words: Sequence[str], command: str) -> str:
+    """tyro's complaint as all others are: the option, its value, what would be right; as it is where it is unknown."""
+    for pattern, should in COMPLAINTS.items():
+        found = re.fullmatch(pattern, complaint)
+        if found:
+            said = found.groupdict()
+            choices = ", ".join(sorted(re.findall(r"'([^']*)'", said.get("choices", ""))))
+            value = _as_typed(said.get("value", "nothing"), words)
+            return f"{said['option']} = {value}: should be {should}{choices}"
+    unknown = re.fullmatch(r"Unrecognized options: (.*)", complaint)
+    if not unknown:
+        return complaint
+    first = unknown[1].split(", ")[0]
+    before = words[words.index(first) - 1] if first in words[1:] else ""
+    if before.startswith("--") and not first.startswith("-"):
+        return f"{before} = {first!r}: should be left out; {before} takes no value"
+    return f"{unknown[1]}: should be left out; segvisrl {command} --help lists the options"
+
+
+def _as_typed(value: str, words: Sequence[str]) -> str:
+    """A value whole again that tyro broke at the end of a line."""
+    typed = (repr(part) for word in words for part in (word, word.partition("=")[2]))
+    return next((part for part in typed if "".join(part.split()) == "".join(value.split())), value)
 
 
 def _usage() -> str:

@@ -1,7 +1,6 @@
 """``segvisrl train``: one training run and everything that it leaves behind."""
 
 import contextlib
-import json
 import math
 import os
 import sys
@@ -18,8 +17,10 @@ from segvisrl_jax.config import (
     flatten,
     from_dict,
     preset_config,
+    read_json,
     replace_fields,
     require,
+    require_folder_can_be_made,
     to_dict,
 )
 
@@ -31,6 +32,7 @@ TEST_EPISODES = 200  # driven after training, on scenes that neither training no
 def run(options: Sequence[str]) -> int:
     """Parses, trains, evaluates, draws."""
     config = parse_config(options)
+    require_folder_can_be_made(Path(config.runs_dir), "runs_dir")
 
     from segvisrl_jax.training.loop import DivergedError, train
 
@@ -84,6 +86,7 @@ def parse_config(options: Sequence[str]) -> TrainConfig:
         base = _stored_config(runs_dir, name)
         if base is not None:
             return parse(TrainConfig, words, "train", base)
+    require(words[-1:] != ["--preset"], "--preset", "nothing", "followed by auto, or a preset's name")
     if preset == "auto":
         should = "named where processes train together, e.g. gpu"
         require("--coordinator" not in words, "preset", "auto", should)  # JAX is not to be asked before they have met
@@ -97,8 +100,8 @@ def _stored_config(runs_dir: str, run_name: str) -> TrainConfig | None:
     if not run_name or not file.is_file():
         return None
     try:
-        stored = from_dict(TrainConfig, json.loads(file.read_text()))
-    except ValueError as error:
+        stored = from_dict(TrainConfig, read_json(file))
+    except (OSError, ValueError) as error:
         raise ConfigError(f"{file}: not a run's settings ({error})") from None
     return replace_fields(stored, coordinator="", num_processes=1, process_id=0)  # who goes on, says so
 

@@ -18,7 +18,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from segvisrl_jax.assets import asset_dir
-from segvisrl_jax.config import ConfigError, TrainConfig, from_dict, to_dict
+from segvisrl_jax.config import ConfigError, TrainConfig, from_dict, read_json, to_dict
 from segvisrl_jax.training.manifest import (
     MANIFEST,
     library_versions,
@@ -255,13 +255,13 @@ def load_policy(folder: Path) -> tuple[TrainConfig, Any, dict[str, Any]]:
 def _read_card(path: Path) -> tuple[TrainConfig, dict[str, Any], Path]:
     """(settings, scores, the file of the parameters) of a policy; what has checksums agrees with them."""
     try:
-        card = json.loads(path.read_text())
+        card = read_json(path)
         version, checksum = int(card["format"]), card.pop("sha256", None)
         if version <= POLICY_FORMAT and (version < FIRST_WITH_CHECKSUMS or checksum == sha256_of_json(card)):
             config, scores = from_dict(TrainConfig, card["config"]), card["scores"]
             params = card["params"] if version >= FIRST_WITH_CHECKSUMS else {"file": "params.npz"}
             params_file = path.parent / Path(params["file"]).name
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{path}: not a policy's card ({error})") from None
     if version > POLICY_FORMAT:
         raise ConfigError(f"{path}: was written by a newer version of segvisrl_jax (format {version})")

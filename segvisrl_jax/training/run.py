@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from segvisrl_jax.agent.networks import Params
-from segvisrl_jax.config import ConfigError, TrainConfig, flatten, to_dict
+from segvisrl_jax.config import ConfigError, TrainConfig, flatten, read_json, to_dict
 from segvisrl_jax.training.checkpoint import Checkpoints, save_policy
 from segvisrl_jax.training.loggers import one_line
 from segvisrl_jax.training.manifest import replace_file
@@ -252,7 +252,7 @@ def open_run_dir(config: TrainConfig) -> Path:
     if not config_file.is_file():
         raise ConfigError(f"run = {str(run_dir)!r}: has no checkpoint to resume; leave --resume out")
     try:
-        before = json.loads(config_file.read_text())
+        before = read_json(config_file)
         then = flatten(to_dict(TrainConfig())) | flatten(before)
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise ConfigError(f"{config_file}: cannot be read ({one_line(error)})") from None
