@@ -53,7 +53,7 @@ COMMAND_CASES: list[tuple[list[str], str, str]] = [  # words, the field that is 
     (["eval", "--controller", "q"], "--controller", "q"),
     (["eval", "--policy", "nowhere"], "policy", "nowhere"),
     (["eval", "--policy", LONG_NAME], "", LONG_NAME),
-    (["eval", "--policy", "damaged/card"], "policy.json", "config"),
+    (["eval", "--policy", "damaged/card"], "policy.json", "format"),
     (["eval", "--policy", "damaged/arrays"], "params.npz", "cannot be read"),
     (["eval", "--policy", "damaged/narrow"], "bias", "(256,)"),
     (["eval", "--run", "nowhere"], "--run", "nowhere"),

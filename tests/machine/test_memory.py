@@ -24,7 +24,7 @@ ADVICE = ["--ppo.redraw-observations", "--ppo.num-minibatches", "--ppo.num-envs"
 
 
 def failing(error):
-    def run(options):
+    def run(options, **more):
         raise error
 
     return run
