@@ -4,7 +4,7 @@ Every option comes from a dataclass (tyro). Nothing heavy is imported before it 
 """
 
 import contextlib
-import ctypes
+import errno
 import importlib
 import io
 import os
@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from segvisrl_jax.config import ConfigError
+from segvisrl_jax.machine.memory import OutOfMemory, keep_freed_memory, one_line_where_memory_ends, what_there_is
 from segvisrl_jax.machine.programs import keep_compiled_programs
 
 COMMANDS = {
@@ -30,10 +31,26 @@ COMMANDS = {
     "doctor": "say whether this machine can do the work, how fast, and what to mend",
 }
 TIMED = ("bench",)  # compiles everything anew: it reports how long that takes
+SMALLER = {  # what makes a command take less memory; train says more
+    "eval": "--slots 32 drives fewer episodes at the same time",
+    "bench": "smaller --batch and --batches, or a larger --scale, take less",
+}
+FAILURE = 1
 USAGE_ERROR = 2
 INTERRUPTED = 130
+BAD_PATH = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR, errno.EACCES)
 READER_GONE = 141  # what a shell gives for SIGPIPE: the output went to `head`, which had enough
 OptionsT = TypeVar("OptionsT")
+COMPLAINTS = {
+    r"Error parsing (?P<option>-\S+): invalid literal for int\(\) with base 10: (?P<value>.*)": "a whole number",
+    r"Error parsing (?P<option>-\S+): could not convert string to float: (?P<value>.*)": "a number",
+    r"Error parsing (?P<option>-\S+): Could not find valid parse for arguments: (?P<value>.*)": "whole numbers",
+    r"Error parsing (?P<option>-\S+): no type matching \{None\}\|INT could be instantiated from "
+    r"\[(?P<value>.*?)\]\. Got errors: .*": "a whole number, or None",
+    r"invalid choice (?P<value>.*) for argument '(?P<option>.*)'\. Expected one of \((?P<choices>.*)\)\.": "one of ",
+    r"Missing value for argument '(?P<option>.*)'\. Expected \d+ values?\.": "followed by a value",
+}
+"""What tyro says of a value, and what would be right."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -51,37 +68,37 @@ def main(argv: Sequence[str] | None = None) -> int:
     if command not in COMMANDS:
         print(f"segvisrl: {command!r} is not a command; there are: {', '.join(COMMANDS)}", file=sys.stderr)
         return USAGE_ERROR
-    _keep_freed_memory()
+    keep_freed_memory()
     if command not in TIMED:
         keep_compiled_programs()
     try:
         module = importlib.import_module(f"segvisrl_jax.commands.{command}")
-        code = module.run(options)
+        with one_line_where_memory_ends(what_there_is(SMALLER.get(command, ""))):
+            code = module.run(options)
         sys.stdout.flush()
         return code
     except ConfigError as error:
-        print(f"segvisrl {command}: {error}", file=sys.stderr)
+        _complain(command, str(error))
         return USAGE_ERROR
+    except OutOfMemory as error:
+        print(f"segvisrl {command}: {error}", file=sys.stderr)
+        return FAILURE
     except KeyboardInterrupt:
         print(f"\nsegvisrl {command}: interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more when it ends
         return READER_GONE
+    except OSError as error:
+        if error.errno not in BAD_PATH or error.filename is None:
+            raise
+        _complain(command, f"{os.fsdecode(error.filename)!r}: should be a path that can be used ({error.strerror})")
+        return USAGE_ERROR
 
 
-def _keep_freed_memory() -> None:
-    """Tells glibc to keep freed memory for the next allocation, where there is glibc.
-
-    XLA on a CPU allocates its buffers anew in every call. Those above 32 MiB come fresh from the kernel each time, page
-    by page, which costs a quarter of the gradient's time. See mallopt(3).
-    """
-    with contextlib.suppress(OSError, AttributeError):
-        mallopt = ctypes.CDLL("libc.so.6").mallopt
-        trim_threshold, mmap_max, arena_max = -1, -4, -8  # M_TRIM_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX of malloc.h
-        mallopt(trim_threshold, 2**31 - 1)
-        mallopt(mmap_max, 0)
-        mallopt(arena_max, 1)
+def _complain(command: str, what: str) -> None:
+    """One line, whatever a name or a value has in it."""
+    print(f"segvisrl {command}: {' '.join(what.splitlines())}", file=sys.stderr)
 
 
 def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: OptionsT | None = None) -> OptionsT:
@@ -103,7 +120,7 @@ def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: O
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise _config_error(stop) or ConfigError(_one_line(said.getvalue())) from None
+        raise _config_error(stop) or ConfigError(_in_our_words(_one_line(said.getvalue()), words, command)) from None
 
 
 def _config_error(error: BaseException | None) -> ConfigError | None:
@@ -130,6 +147,31 @@ def _one_line(message: str) -> str:
         if line:
             paragraph.append(line)
     return " ".join(paragraph)
+
+
+def _in_our_words(complaint: str, words: Sequence[str], command: str) -> str:
+    """tyro's complaint as all others are: the option, its value, what would be right; as it is where it is unknown."""
+    for pattern, should in COMPLAINTS.items():
+        found = re.fullmatch(pattern, complaint)
+        if found:
+            said = found.groupdict()
+            choices = ", ".join(sorted(re.findall(r"'([^']*)'", said.get("choices", ""))))
+            value = _as_typed(said.get("value", "nothing"), words)
+            return f"{said['option']} = {value}: should be {should}{choices}"
+    unknown = re.fullmatch(r"Unrecognized options: (.*)", complaint)
+    if not unknown:
+        return complaint
+    first = unknown[1].split(", ")[0]
+    before = words[words.index(first) - 1] if first in words[1:] else ""
+    if before.startswith("--") and not first.startswith("-"):
+        return f"{before} = {first!r}: should be left out; {before} takes no value"
+    return f"{unknown[1]}: should be left out; segvisrl {command} --help lists the options"
+
+
+def _as_typed(value: str, words: Sequence[str]) -> str:
+    """A value whole again that tyro broke at the end of a line."""
+    typed = (repr(part) for word in words for part in (word, word.partition("=")[2]))
+    return next((part for part in typed if "".join(part.split()) == "".join(value.split())), value)
 
 
 def _usage() -> str:

@@ -1,10 +1,11 @@
 """``segvisrl bench``: how fast physics, rendering and learning run on this machine."""
 
 import json
+import os
 import platform
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,8 +23,9 @@ from segvisrl_jax.config import (
     replace_fields,
     require,
 )
+from segvisrl_jax.machine.growth import GrowthSizes
 
-Part = Literal["physics", "render", "policy", "update", "train", "start", "peers"]
+Part = Literal["physics", "render", "policy", "update", "train", "start", "peers", "growth"]
 FEW = {"num_envs": 8, "num_minibatches": 2}  # on a CPU, for the update: minibatches as large as the preset's
 PlainRenderer = Literal["scanline", "gl", "warp", "mujoco.Renderer"]
 """The project's renderers, and MuJoCo's Python class as one would use it without this project."""
@@ -36,7 +38,8 @@ class BenchOptions:
     parts: tyro.conf.Positional[tuple[Part, ...]] = ("physics", "render", "train")
     """physics, render, train; these three where none is named. policy, update: the network's decisions and learning, as
     shares of what the machine does in a large matrix product. start: what comes before a training's first update.
-    peers: PyTorch and sb3-contrib beside this project (needs the extra [sb3])."""
+    peers: PyTorch and sb3-contrib beside this project (needs the extra [sb3]). growth: time and memory against rocks,
+    environments, image and unroll, one of them varied at a time; 20 to 25 minutes."""
     batch: int = 32
     """Environments at once, for physics."""
     batches: tuple[int, ...] = (1, 16, 64, 256)
@@ -52,14 +55,21 @@ class BenchOptions:
     renderers: tuple[PlainRenderer, ...] = ("scanline", "gl", "warp", "mujoco.Renderer")
     json: Path | None = None
     """Where to write the result as JSON."""
+    plot: Path | None = None
+    """Where to draw growth (.png); None: beside the JSON, with its name."""
+    growth: GrowthSizes = field(default_factory=GrowthSizes)
 
     def __post_init__(self) -> None:
         require(1 <= self.batch <= 65536, "--batch", self.batch, "in [1, 65536]")
         for batch in self.batches:
             require(1 <= batch <= 65536, "--batches", batch, "in [1, 65536]")
         require(1 <= self.repeats <= 1000, "--repeats", self.repeats, "in [1, 1000]")
-        folder_exists = self.json is None or self.json.resolve().parent.is_dir()
-        require(folder_exists, "--json", str(self.json), "in a folder that exists")
+        for option, path in (("--json", self.json), ("--plot", self.plot)):
+            folder_exists = path is None or path.resolve().parent.is_dir()
+            require(folder_exists, option, str(path), "in a folder that exists")
+        if self.plot is not None:
+            require("growth" in self.parts, "--plot", str(self.plot), "left out without the part growth")
+            require(self.plot.suffix == ".png", "--plot", str(self.plot), "a name that ends in .png")
 
 
 def run(options: Sequence[str]) -> int:
@@ -73,7 +83,10 @@ def run(options: Sequence[str]) -> int:
         "train": _train,
         "start": _start,
         "peers": _peers,
+        "growth": _growth,
     }
+    if "growth" in asked.parts:  # its processes need the memory that JAX here would take and keep
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     before = machine()
     rows: list[dict[str, Any]] = []
     for part in asked.parts:
@@ -83,6 +96,8 @@ def run(options: Sequence[str]) -> int:
             print(f"{part}: {len(measured)} rows measured", end="\r", file=sys.stderr, flush=True)
         _print_table(part, measured)
         rows += [{"part": part, **row} for row in measured]
+        if part == "growth":
+            rows += _conclude_growth(asked, measured)
     if asked.json is not None:
         command = " ".join(["segvisrl bench", *options])
         asked.json.write_text(json.dumps({"command": command, "machine": before, "rows": rows}, indent=2) + "\n")
@@ -91,7 +106,6 @@ def run(options: Sequence[str]) -> int:
 
 def machine() -> dict[str, Any]:
     """What the figures were measured on."""
-    import os
     from importlib.metadata import version
 
     import jax
@@ -237,6 +251,25 @@ def _peers(asked: BenchOptions):
     return peer_rows(preset_config("cnn_lstm", asked.preset), asked.repeats)
 
 
+def _growth(asked: BenchOptions):
+    from segvisrl_jax.machine.growth import growth_rows
+
+    return growth_rows(preset_config(asked.arch, asked.preset), asked.growth, asked.repeats)
+
+
+def _conclude_growth(asked: BenchOptions, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Prints the powers with which costs grow, and draws; the powers as rows."""
+    from segvisrl_jax.machine.growth import MORE_DECISIONS, PARTS, exponent_rows
+    from segvisrl_jax.report.growth_figure import draw_growth
+
+    exponents = list(exponent_rows(rows))
+    _print_table("exponents of growth (cost in all, over the last half of the points; 1 is linear)", exponents)
+    path = asked.plot or (asked.json and asked.json.with_suffix(".png"))
+    if path is not None:
+        print(f"  {draw_growth(rows, PARTS, MORE_DECISIONS, path)}")
+    return [{"part": "growth exponents", **row} for row in exponents]
+
+
 def _env_or_none(config):
     """The environment, or None where its parts cannot run here (said aloud)."""
     from segvisrl_jax.env.rover_env import RoverEnv
@@ -263,6 +296,12 @@ def _print_table(part: str, rows: Sequence[dict[str, Any]]) -> None:
     print(f"{part}\n| {' | '.join(name.replace('_', ' ') for name in names)} |")
     print("|" + "---|" * len(names))
     for row in rows:
-        cells = [f"{v:,.1f}" if isinstance(v := row.get(name, ""), float) else str(v) for name in names]
-        print(f"| {' | '.join(cells)} |")
+        print(f"| {' | '.join(_cell(row.get(name, '')) for name in names)} |")
     print(flush=True)
+
+
+def _cell(value: Any) -> str:
+    """A tenth is enough of what is 10 or more; of what is less, three digits."""
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:,.1f}" if abs(value) >= 10 else f"{value:.3g}"

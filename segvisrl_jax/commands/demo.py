@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from segvisrl_jax.cli import parse
-from segvisrl_jax.config import ConfigError, require
+from segvisrl_jax.config import require, require_file_can_be_written
 
 DEFAULT_POLICY = "cnn_lstm"
 VIDEO_SUFFIXES = (".mp4", ".gif")
@@ -42,8 +42,7 @@ class DemoOptions:
 def run(options: Sequence[str]) -> int:
     """Parses, drives, writes."""
     asked = parse(DemoOptions, options, "demo")
-    if not asked.video.resolve().parent.is_dir():
-        raise ConfigError(f"--output = {str(asked.video)!r}: should be in a folder that exists")
+    require_file_can_be_written(asked.video, "--output")
     outcome = record(asked)
     print(f"{outcome}: {asked.video}")
     return 0

@@ -9,7 +9,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 from segvisrl_jax.cli import parse
-from segvisrl_jax.config import ConfigError, EngineName, EnvConfig, RendererName, TrainConfig, require, to_dict
+from segvisrl_jax.config import (
+    ConfigError,
+    EngineName,
+    EnvConfig,
+    RendererName,
+    TrainConfig,
+    require,
+    require_file_can_be_written,
+    to_dict,
+)
 from segvisrl_jax.config.conditions import ConditionsConfig
 
 
@@ -46,8 +55,8 @@ class EvalOptions:
 def run(options: Sequence[str]) -> int:
     """Parses, drives, prints; writes JSON where asked."""
     asked = parse(EvalOptions, options, "eval")
-    if asked.json is not None and not asked.json.resolve().parent.is_dir():
-        raise ConfigError(f"--json = {str(asked.json)!r}: should be in a folder that exists")
+    if asked.json is not None:
+        require_file_can_be_written(asked.json, "--json")
     result = evaluate(asked)
     print(f"{result['method']}: {report_line(result)}")
     if asked.json is not None:
@@ -173,7 +182,27 @@ def load_driver(run: Path | None, policy: str | None, controller: str | None) ->
         raise ConfigError(f"--run = {str(run)!r}: should be a run's folder that holds a policy (policy/policy.json)")
     config, params, _ = load_policy(policy_folder(run, policy))
     network = make_network(config.arch, config.network, observation_shape(config.env))
+    _require_parameters_that_fit(params, network, policy_folder(run, policy))
     return network_policy(network, config.arch), params, held_out(config)
+
+
+def _require_parameters_that_fit(params: Any, network: Any, folder: Path) -> None:
+    """A policy's folder may have been put together by hand."""
+    import jax
+
+    needed = jax.eval_shape(network.init, jax.random.key(0))
+    ours, theirs = (
+        {jax.tree_util.keystr(path): leaf.shape for path, leaf in _leaves(tree)} for tree in (params, needed)
+    )
+    for name in sorted(ours.keys() | theirs.keys()):
+        should = f"of shape {theirs[name]}, as its settings have it" if name in theirs else "left out"
+        require(ours.get(name) == theirs.get(name), f"{folder}: {name}", ours.get(name), should)
+
+
+def _leaves(tree: Any) -> Any:
+    import jax
+
+    return jax.tree_util.tree_flatten_with_path(tree)[0]
 
 
 def policy_folder(run: Path | None, policy: str | None) -> Path:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from segvisrl_jax.cli import parse
-from segvisrl_jax.config import require
+from segvisrl_jax.config import require, require_file_can_be_written
 from segvisrl_jax.export.formats import SUFFIXES, FormatName, file_format, require_packages
 
 
@@ -37,7 +37,7 @@ class ExportOptions:
             suffix = SUFFIXES[self.format]
             fits = self.output.name.endswith(suffix) and self.output.name != suffix
             require(fits, "--output", str(self.output), f"a name that ends in {suffix}")
-            require(self.output.resolve().parent.is_dir(), "--output", str(self.output), "in a folder that exists")
+        require_file_can_be_written(self.path, "--output")
 
     @property
     def name(self) -> str:

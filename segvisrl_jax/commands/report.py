@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from segvisrl_jax.cli import parse
-from segvisrl_jax.config import EnvConfig, replace_fields, require
+from segvisrl_jax.config import EnvConfig, replace_fields, require, require_file_can_be_written
 
 if TYPE_CHECKING:
     from segvisrl_jax.report.cases import Case
@@ -49,8 +49,9 @@ class ReportOptions:
         require(len(self.runs) > 0, "RUN", "none given", "at least one run's folder")
         names = [run.resolve().name for run in self.runs]
         require(len(set(names)) == len(names), "RUN", " ".join(map(str, self.runs)), "folders with different names")
-        is_page = self.output.suffix == ".html" and self.output.resolve().parent.is_dir()
-        require(is_page, "--output", str(self.output), "a name that ends in .html, in a folder that exists")
+        should = "a name that ends in .html, in a folder that exists"
+        require(self.output.suffix == ".html", "--output", str(self.output), should)
+        require_file_can_be_written(self.output, "--output", should)
         require(1 <= self.episodes <= 10_000, "--episodes", self.episodes, "in [1, 10000]")
         require(0 <= self.seed < 2**31, "--seed", self.seed, "in [0, 2^31)")
         require(0 <= self.videos <= MOST_VIDEOS, "--videos", self.videos, f"in [0, {MOST_VIDEOS}]")

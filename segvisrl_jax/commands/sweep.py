@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from segvisrl_jax.cli import INTERRUPTED, parse
-from segvisrl_jax.config import PresetName, require
+from segvisrl_jax.config import ConfigError, PresetName, require, require_folder_can_be_made
 from segvisrl_jax.sweep.plan import parse_axis
 
 if TYPE_CHECKING:
@@ -47,6 +47,10 @@ class SweepOptions:
     def __post_init__(self) -> None:
         for text in self.vary:
             parse_axis(text)
+        try:
+            shlex.split(self.args)
+        except ValueError as error:
+            raise ConfigError(f"--args = {self.args!r}: should be words as in a shell ({error})") from None
         require(1 <= self.jobs <= 1024, "--jobs", self.jobs, "in [1, 1024]")
         require(self.steps is None or self.steps > 0, "--steps", self.steps, "above 0")
         require(0 < self.cpus_per_run <= 4096, "--cpus-per-run", self.cpus_per_run, "in (0, 4096]")
@@ -61,6 +65,7 @@ def run(options: Sequence[str]) -> int:
 
     asked = parse(SweepOptions, options, "sweep")
     words = ["--preset", asked.preset, *(["--steps", str(asked.steps)] if asked.steps else [])]
+    require_folder_can_be_made(asked.output, "--output")
     axes = [parse_axis(text) for text in asked.vary]
     trials = plan_trials(axes, [*words, *shlex.split(asked.args)])
     check_trials(trials, asked.output, parse_config)

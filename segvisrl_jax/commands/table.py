@@ -4,7 +4,6 @@ This file reads and checks; ``report/table.py`` formats.
 """
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,18 @@ import numpy as np
 import tyro
 
 from segvisrl_jax.cli import parse
-from segvisrl_jax.config import ConfigError, EnvConfig, TaskConfig, TrainConfig, from_dict, require
+from segvisrl_jax.config import (
+    ConfigError,
+    EnvConfig,
+    TaskConfig,
+    TrainConfig,
+    from_dict,
+    is_finite,
+    is_plain_text,
+    read_json,
+    require,
+    require_file_can_be_written,
+)
 from segvisrl_jax.report.table import Evaluation, results_table
 from segvisrl_jax.training.statistics import wilson_interval
 
@@ -39,8 +49,9 @@ class TableOptions:
     def __post_init__(self) -> None:
         require(len(self.files) > 0, "EVAL.json", "none given", "at least one file that segvisrl eval --json wrote")
         if self.output is not None:
-            is_page = self.output.suffix == ".md" and self.output.resolve().parent.is_dir()
-            require(is_page, "--output", str(self.output), "a name that ends in .md, in a folder that exists")
+            should = "a name that ends in .md, in a folder that exists"
+            require(self.output.suffix == ".md", "--output", str(self.output), should)
+            require_file_can_be_written(self.output, "--output", should)
 
 
 def run(options: Sequence[str]) -> int:
@@ -72,14 +83,14 @@ def read_evaluation(path: Path) -> Evaluation:
         ConfigError: where it cannot be read or does not; one line that names the file.
     """
     try:
-        data = json.loads(path.read_text())
+        data = read_json(path)
         require(isinstance(data, dict), "content", type(data).__name__, "an object")
         evaluation = evaluation_of(str(path), data)
         _require_numbers(data)
         _require_agreement(data)
     except KeyError as error:
         raise ConfigError(f"{path}: has no {error}; should be a file that this version's segvisrl eval wrote") from None
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, TypeError, AttributeError, ArithmeticError) as error:
         reason = " ".join(str(error).split())[:300]
         raise ConfigError(f"{path}: should be a file that segvisrl eval --json wrote ({reason})") from None
     return evaluation
@@ -111,7 +122,7 @@ def evaluation_of(file: str, data: dict[str, Any]) -> Evaluation:
 
 
 def _text(data: dict[str, Any], name: str) -> str:
-    require(isinstance(data[name], str), name, data[name], "text")
+    require(is_plain_text(data[name]), name, data[name], "text without control characters")
     return data[name]
 
 
@@ -121,7 +132,7 @@ def _count(data: dict[str, Any], name: str, least: int) -> int:
 
 
 def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and bool(np.isfinite(value))
+    return type(value) in (int, float) and is_finite(value)
 
 
 def _require_numbers(data: dict[str, Any]) -> None:
@@ -133,7 +144,9 @@ def _require_numbers(data: dict[str, Any]) -> None:
     for name in ("path_ratio", "mean_time_s", "min_clearance_m"):
         require(data[name] is None or _is_number(data[name]), name, data[name], "a number or null")
     require(_is_number(data["wall_clock_s"]), "wall_clock_s", data["wall_clock_s"], "a number")
-    require(isinstance(data["versions"], dict), "versions", data["versions"], "an object")
+    versions = data["versions"]
+    is_sound = isinstance(versions, dict) and all(map(is_plain_text, (*versions, *versions.values())))
+    require(is_sound, "versions", versions, "an object of names and texts")
     _text(data, "command")
     _text(data, "device")
 

@@ -1,7 +1,9 @@
 """``segvisrl train``: one training run and everything that it leaves behind."""
 
-import json
+import contextlib
 import math
+import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,38 +17,62 @@ from segvisrl_jax.config import (
     flatten,
     from_dict,
     preset_config,
+    read_json,
     replace_fields,
     require,
+    require_folder_can_be_made,
     to_dict,
 )
 
+FAILED = 1
+SHOW_CURSOR = "\x1b[?25h"
 TEST_EPISODES = 200  # driven after training, on scenes that neither training nor the choice of the policy saw
 
 
 def run(options: Sequence[str]) -> int:
     """Parses, trains, evaluates, draws."""
     config = parse_config(options)
+    require_folder_can_be_made(Path(config.runs_dir), "runs_dir")
 
-    from segvisrl_jax.training.loop import train
+    from segvisrl_jax.training.loop import DivergedError, train
 
     is_first = config.process_id == 0
     if not config.resume and is_first:
         print(differences_from_paper(config))
         print(observation_memory(config))
-    result = train(config)
+    going_on = f"Go on with:\n  {_resuming(config)}"
+    try:
+        with _told_where_memory_ends(config):
+            result = train(config, when_late=lambda said: _end_now(f"{said} {going_on}"))
+    except DivergedError as error:
+        print(f"segvisrl train: {error}", file=sys.stderr)
+        return FAILED
     if not is_first:
         return 0 if result.finished else INTERRUPTED
-    resume = f"segvisrl train --resume --runs-dir {config.runs_dir} --run {config.run_name}"
-    if config.num_seeds > 1:
-        resume += f" --seed {config.seed} --num-seeds {config.num_seeds}"
+    if result.not_on_disk:
+        print(f"segvisrl train: could not be written: {'; '.join(result.not_on_disk)}", file=sys.stderr)
+        return FAILED
     if not result.finished:
-        print(f"Stopped and saved after {result.decisions:,} decisions. Go on with:\n  {resume}")
+        print(f"Stopped and saved after {result.decisions:,} decisions. {going_on}")
         return INTERRUPTED
     for each, run_dir in zip(config.runs, result.run_dirs, strict=True):
         _finish(each, run_dir)
     if config.num_seeds > 1:
         print(f"All seeds: {_draw_together(config, result.run_dirs)}")
     return 0
+
+
+def _resuming(config: TrainConfig) -> str:
+    """The command that goes on with a run, or with all seeds."""
+    resume = f"segvisrl train --resume --runs-dir {config.runs_dir} --run {config.run_name}"
+    return resume + (f" --seed {config.seed} --num-seeds {config.num_seeds}" if config.num_seeds > 1 else "")
+
+
+def _end_now(said: str) -> None:
+    """Ends the process from whichever thread, whatever the others do; the terminal gets its cursor back."""
+    sys.stdout.write((SHOW_CURSOR if sys.stdout.isatty() else "") + f"\n{said}\n")
+    sys.stdout.flush()
+    os._exit(INTERRUPTED)
 
 
 def parse_config(options: Sequence[str]) -> TrainConfig:
@@ -60,6 +86,7 @@ def parse_config(options: Sequence[str]) -> TrainConfig:
         base = _stored_config(runs_dir, name)
         if base is not None:
             return parse(TrainConfig, words, "train", base)
+    require(words[-1:] != ["--preset"], "--preset", "nothing", "followed by auto, or a preset's name")
     if preset == "auto":
         should = "named where processes train together, e.g. gpu"
         require("--coordinator" not in words, "preset", "auto", should)  # JAX is not to be asked before they have met
@@ -73,8 +100,8 @@ def _stored_config(runs_dir: str, run_name: str) -> TrainConfig | None:
     if not run_name or not file.is_file():
         return None
     try:
-        stored = from_dict(TrainConfig, json.loads(file.read_text()))
-    except ValueError as error:
+        stored = from_dict(TrainConfig, read_json(file))
+    except (OSError, ValueError) as error:
         raise ConfigError(f"{file}: not a run's settings ({error})") from None
     return replace_fields(stored, coordinator="", num_processes=1, process_id=0)  # who goes on, says so
 
@@ -111,7 +138,7 @@ def differences_from_paper(config: TrainConfig) -> str:
     paper = flatten(to_dict(preset_config(config.arch, "paper")))
     ours = flatten(to_dict(config))
     bookkeeping = (
-        "seed", "run", "runs_dir", "resume", "preset", "checkpoint_every_updates", "loggers",
+        "seed", "run", "runs_dir", "resume", "preset", "checkpoint_every_updates", "max_bad_updates", "loggers",
         "num_seeds", "num_devices", "coordinator", "num_processes", "process_id",
     )  # fmt: skip
     rows = [
@@ -135,6 +162,23 @@ def observation_memory(config: TrainConfig) -> str:
     if config.ppo.redraw_observations:
         return f"  observations: {total:,.1f} MB a batch, drawn again when needed (not stored)"
     return f"  observations: {total:,.1f} MB a batch, stored"
+
+
+def _told_where_memory_ends(config: TrainConfig) -> contextlib.AbstractContextManager[None]:
+    """Warns where memory will not be enough, and says in one line what to do where it was not.
+
+    Of several processes, none is to ask JAX before they have met, and training itself ends all where one fails.
+    """
+    from segvisrl_jax.machine import memory
+
+    if config.num_processes > 1:
+        return contextlib.nullcontext()
+    on_cpu = preset_for_this_machine() == "cpu"
+    need, (all_bytes, free_bytes) = memory.need_of(config, on_cpu), memory.there_is(on_cpu)
+    warning = memory.warning(config, need, free_bytes)
+    if warning:
+        print(warning)
+    return memory.one_line_where_memory_ends(memory.last_words(config, need, all_bytes, on_cpu))
 
 
 def _short(value: Any) -> str:

@@ -31,6 +31,7 @@ class ViewOptions:
 
     def __post_init__(self) -> None:
         require(0 <= self.scene < 2**31, "--scene", self.scene, "in [0, 2^31)")
+        require(bool(self.host.strip()), "--host", self.host, "an address of this machine; 0.0.0.0 is every one")
         require(0 <= self.port < 2**16, "--port", self.port, "in [0, 65535]")
 
 
@@ -77,7 +78,7 @@ def require_free_port(host: str, port: int) -> None:
             probe.bind(address)
     except PermissionError:
         raise ConfigError(f"--port = {port}: should be 1024 or more for this user") from None
-    except socket.gaierror:
+    except (socket.gaierror, UnicodeError):
         raise ConfigError(f"--host = {host!r}: should be an address of this machine") from None
     except OSError as error:
         raise ConfigError(f"--host, --port = {host}:{port}: should be free ({error.strerror})") from None

@@ -4,7 +4,7 @@ Units are in the names. A wrong value raises ``ConfigError`` with one line: the 
 Nothing here depends on JAX or MuJoCo.
 """
 
-from segvisrl_jax.config.checks import ConfigError, require
+from segvisrl_jax.config.checks import ConfigError, is_finite, is_plain_text, read_json, require
 from segvisrl_jax.config.conditions import ConditionsConfig
 from segvisrl_jax.config.environment import CameraConfig, EnvConfig, PhysicsConfig, SceneConfig, TaskConfig
 from segvisrl_jax.config.learning import EvaluationConfig, NetworkConfig, PPOConfig, TrainConfig
@@ -18,6 +18,7 @@ from segvisrl_jax.config.names import (
     PresetName,
     RendererName,
 )
+from segvisrl_jax.config.paths import require_file_can_be_written, require_folder_can_be_made
 from segvisrl_jax.config.presets import preset_config
 from segvisrl_jax.config.tree import flatten, from_dict, replace_fields, to_dict
 
@@ -43,8 +44,13 @@ __all__ = [
     "TrainConfig",
     "flatten",
     "from_dict",
+    "is_finite",
+    "is_plain_text",
     "preset_config",
+    "read_json",
     "replace_fields",
     "require",
+    "require_file_can_be_written",
+    "require_folder_can_be_made",
     "to_dict",
 ]

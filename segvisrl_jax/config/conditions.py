@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import get_args
 
-from segvisrl_jax.config.checks import require, require_finite_numbers
+from segvisrl_jax.config.checks import require, require_types
 from segvisrl_jax.config.names import IMAGE_OBSERVATIONS, ObservationKind
 
 
@@ -58,7 +58,7 @@ class ConditionsConfig:
 
     def __post_init__(self) -> None:
         p = "conditions"
-        require_finite_numbers(self, p)
+        require_types(self, p)
         for name, (low, high) in _ALLOWED.items():
             value = getattr(self, name)
             require(low <= value <= high, f"{p}.{name}", value, f"in [{low:g}, {high:g}]")

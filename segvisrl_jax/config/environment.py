@@ -3,9 +3,12 @@
 import math
 from dataclasses import dataclass, field
 
-from segvisrl_jax.config.checks import require, require_choice, require_divides, require_finite_numbers
+from segvisrl_jax.config.checks import require, require_divides, require_types
 from segvisrl_jax.config.conditions import NEUTRAL, SCANLINE_ONLY, ConditionsConfig
 from segvisrl_jax.config.names import EngineName, ObservationKind, RendererName
+
+LARGEST_M = 1e4  # ten times the largest map: what is meant to be without a limit
+LARGEST_REWARD = 10**6  # squared, and summed over a batch, it is still far from what a float32 can hold
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         p = "scene"
-        require_finite_numbers(self, p)
+        require_types(self, p)
         half = self.map_size_m / 2
         require(0 < self.map_size_m <= 1000, f"{p}.map_size_m", self.map_size_m, "in (0, 1000] metres")
         require(0 <= self.start_inset_m < half, f"{p}.start_inset_m", self.start_inset_m, f"in [0, {half})")
@@ -64,7 +67,8 @@ class SceneConfig:
         require(0 <= share <= 1, f"{p}.random_start_yaw_share", share, "in [0, 1]")
         low, high = self.goal_distance_min_m, self.goal_distance_max_m
         require(low > 0, f"{p}.goal_distance_min_m", low, "positive")
-        require(high > low, f"{p}.goal_distance_max_m", high, f"more than goal_distance_min_m = {low}")
+        should = f"more than goal_distance_min_m = {low}, and at most {LARGEST_M:g} metres"
+        require(low < high <= LARGEST_M, f"{p}.goal_distance_max_m", high, should)
         reach = math.hypot(self.map_size_m - self.start_inset_m, half)
         require(
             low < 0.98 * reach, f"{p}.goal_distance_min_m", low, f"below {0.98 * reach:.2f}, so that it fits the map"
@@ -77,11 +81,11 @@ class SceneConfig:
             require(rocks <= shapes, f"{p}.{name}", rocks, f"at most num_rock_shapes = {shapes}")
         small, large = self.rock_radius_min_m, self.rock_radius_max_m
         require(small >= 0.02, f"{p}.rock_radius_min_m", small, "at least 0.02")
-        require(large >= small, f"{p}.rock_radius_max_m", large, f"at least rock_radius_min_m = {small}")
-        require(
-            self.rock_start_clearance_m >= 0, f"{p}.rock_start_clearance_m", self.rock_start_clearance_m, "0 or more"
-        )
-        require(self.rock_goal_clearance_m >= 0, f"{p}.rock_goal_clearance_m", self.rock_goal_clearance_m, "0 or more")
+        should = f"at least rock_radius_min_m = {small}, and at most 10 metres"
+        require(small <= large <= 10, f"{p}.rock_radius_max_m", large, should)
+        for name in ("rock_start_clearance_m", "rock_goal_clearance_m"):
+            clearance = getattr(self, name)
+            require(0 <= clearance <= 1000, f"{p}.{name}", clearance, "in [0, 1000] metres")
         require(0 <= self.rock_shapes_seed < 2**32, f"{p}.rock_shapes_seed", self.rock_shapes_seed, "in [0, 2^32)")
         require(1 <= self.sun_elevation_deg <= 90, f"{p}.sun_elevation_deg", self.sun_elevation_deg, "in [1, 90]")
         require(-360 <= self.sun_azimuth_deg <= 360, f"{p}.sun_azimuth_deg", self.sun_azimuth_deg, "in [-360, 360]")
@@ -129,16 +133,21 @@ class TaskConfig:
 
     def __post_init__(self) -> None:
         p = "task"
-        require_finite_numbers(self, p)
-        require(self.judge_dt_s > 0, f"{p}.judge_dt_s", self.judge_dt_s, "positive")
-        require(self.decision_dt_s > 0, f"{p}.decision_dt_s", self.decision_dt_s, "positive")
+        require_types(self, p)
+        for name in ("judge_dt_s", "decision_dt_s"):
+            seconds = getattr(self, name)
+            require(1e-4 <= seconds <= 3600, f"{p}.{name}", seconds, "in [0.0001, 3600] seconds")
         require_divides(self.judge_dt_s, self.decision_dt_s, f"{p}.judge_dt_s", f"{p}.decision_dt_s")
         require(1 <= self.max_decisions <= 10**6, f"{p}.max_decisions", self.max_decisions, "in [1, 1000000]")
-        require(self.collision_radius_m > 0, f"{p}.collision_radius_m", self.collision_radius_m, "positive")
+        for name in ("collision_radius_m", "goal_radius_m"):
+            radius = getattr(self, name)
+            require(0 < radius <= 1000, f"{p}.{name}", radius, "in (0, 1000] metres")
         margin = self.collision_margin_m
         require(0 <= margin <= 10, f"{p}.collision_margin_m", margin, "in [0, 10] metres")
-        require(self.goal_radius_m > 0, f"{p}.goal_radius_m", self.goal_radius_m, "positive")
         require(0 < self.max_tilt_deg < 180, f"{p}.max_tilt_deg", self.max_tilt_deg, "in (0, 180)")
+        for name in ("progress_reward_per_m", "collision_reward", "fall_reward", "timeout_reward"):
+            reward = getattr(self, name)
+            require(abs(reward) <= LARGEST_REWARD, f"{p}.{name}", reward, f"in [-{LARGEST_REWARD}, {LARGEST_REWARD}]")
 
 
 @dataclass(frozen=True)
@@ -160,8 +169,7 @@ class PhysicsConfig:
 
     def __post_init__(self) -> None:
         p = "physics"
-        require_finite_numbers(self, p)
-        require_choice(self.engine, EngineName, f"{p}.engine")
+        require_types(self, p)
         require(
             1e-4 <= self.timestep_s <= 0.05,
             f"{p}.timestep_s",
@@ -200,11 +208,12 @@ class CameraConfig:
 
     def __post_init__(self) -> None:
         p = "camera"
-        require_finite_numbers(self, p)
+        require_types(self, p)
         require(4 <= self.width_px <= 8192, f"{p}.width_px", self.width_px, "in [4, 8192]")
         require(4 <= self.height_px <= 8192, f"{p}.height_px", self.height_px, "in [4, 8192]")
         fov = self.horizontal_fov_deg
         require(5 <= fov <= 150, f"{p}.horizontal_fov_deg", fov, "in [5, 150]")
+        require(0 < self.far_m <= LARGEST_M, f"{p}.far_m", self.far_m, f"in (0, {LARGEST_M:g}] metres")
         require(0 < self.near_m < self.far_m, f"{p}.near_m", self.near_m, f"between 0 and far_m = {self.far_m}")
         largest = min(self.width_px, self.height_px) / 4
         require(self.scale >= 1, f"{p}.scale", self.scale, "1 or more")
@@ -229,8 +238,7 @@ class EnvConfig:
     conditions: ConditionsConfig = field(default_factory=ConditionsConfig)
 
     def __post_init__(self) -> None:
-        require_choice(self.obs, ObservationKind, "env.obs")
-        require_choice(self.renderer, RendererName, "env.renderer")
+        require_types(self, "env")
         require_divides(self.physics.timestep_s, self.task.judge_dt_s, "physics.timestep_s", "task.judge_dt_s")
         radius, limit = self.scene.rock_radius_max_m, self.task.collision_radius_m
         should = (
@@ -240,6 +248,14 @@ class EnvConfig:
         clearance, needed = self.scene.rock_goal_clearance_m, limit + self.task.collision_margin_m
         should = f"more than task.collision_radius_m + collision_margin_m = {needed}, so that the goal can be reached"
         require(clearance > needed, "scene.rock_goal_clearance_m", clearance, should)
+        clearance, should = (
+            self.scene.rock_start_clearance_m,
+            should.replace("the goal can be reached", "no rover starts in a collision"),
+        )
+        require(clearance > needed, "scene.rock_start_clearance_m", clearance, should)
+        radius, nearest = self.task.goal_radius_m, self.scene.goal_distance_min_m
+        should = f"below scene.goal_distance_min_m = {nearest}, so that no rover starts at its goal"
+        require(radius < nearest, "task.goal_radius_m", radius, should)
         self._require_conditions_that_fit()
 
     def _require_conditions_that_fit(self) -> None:

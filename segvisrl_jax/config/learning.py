@@ -2,9 +2,13 @@
 
 from dataclasses import dataclass, field, replace
 
-from segvisrl_jax.config.checks import ConfigError, require, require_choice, require_finite_numbers
+from segvisrl_jax.config.checks import LONGEST_NAME_BYTES, ConfigError, require, require_choice, require_types
 from segvisrl_jax.config.environment import EnvConfig
 from segvisrl_jax.config.names import ARCH_OBSERVATION, Arch, LoggerName, PresetName
+from segvisrl_jax.config.paths import A_PATH, is_path
+
+LARGEST_BATCH = 10**8  # decisions: beyond it, images of any size fill every memory
+MOST_DEVICES = 2**16
 
 
 @dataclass(frozen=True)
@@ -33,11 +37,10 @@ class NetworkConfig:
 
     def __post_init__(self) -> None:
         p = "network"
-        require_finite_numbers(self, p)
+        require_types(self, p)
         for name, sizes in (("channels", self.channels), ("mlp_sizes", self.mlp_sizes)):
-            good = isinstance(sizes, tuple) and len(sizes) > 0
-            good = good and all(type(size) is int and 1 <= size <= 4096 for size in sizes)
-            require(good, f"{p}.{name}", sizes, "one or more whole numbers in [1, 4096]")
+            good = 1 <= len(sizes) <= 32 and all(1 <= size <= 4096 for size in sizes)
+            require(good, f"{p}.{name}", sizes, "one or more whole numbers in [1, 4096], at most 32 of them")
         require(0 <= self.blocks_per_stage <= 16, f"{p}.blocks_per_stage", self.blocks_per_stage, "in [0, 16]")
         require(1 <= self.feature_size <= 8192, f"{p}.feature_size", self.feature_size, "in [1, 8192]")
         require(1 <= self.lstm_size <= 8192, f"{p}.lstm_size", self.lstm_size, "in [1, 8192]")
@@ -94,10 +97,12 @@ class PPOConfig:
 
     def __post_init__(self) -> None:
         p = "ppo"
-        require_finite_numbers(self, p)
+        require_types(self, p)
         for name in ("num_envs", "unroll_length", "num_minibatches", "num_epochs"):
             value = getattr(self, name)
             require(1 <= value <= 10**6, f"{p}.{name}", value, "in [1, 1000000]")
+        batch, should = self.decisions_per_update, f"at most {LARGEST_BATCH}"
+        require(batch <= LARGEST_BATCH, f"{p}.num_envs * unroll_length", batch, should)
         divides = self.num_envs % self.num_minibatches == 0
         should = f"a divisor of num_envs = {self.num_envs}, since minibatches are cut by environment"
         require(divides, f"{p}.num_minibatches", self.num_minibatches, should)
@@ -106,11 +111,12 @@ class PPOConfig:
             value = getattr(self, name)
             require(0 <= value <= 1, f"{p}.{name}", value, "in [0, 1]")
         require(0 < self.clip_epsilon < 10, f"{p}.clip_epsilon", self.clip_epsilon, "in (0, 10)")
-        require(self.max_gradient_norm > 0, f"{p}.max_gradient_norm", self.max_gradient_norm, "positive")
-        require(self.reward_scale > 0, f"{p}.reward_scale", self.reward_scale, "positive")
+        norm, scale = self.max_gradient_norm, self.reward_scale
+        require(0 < norm <= 1e9, f"{p}.max_gradient_norm", norm, "positive, and at most 1e9, which clips nothing")
+        require(0 < scale <= 1e6, f"{p}.reward_scale", scale, "positive, and at most 1e6")
         for name in ("entropy_cost", "value_cost", "kl_stop", "kl_target"):
             value = getattr(self, name)
-            require(value >= 0, f"{p}.{name}", value, "0 or more")
+            require(0 <= value <= 1e6, f"{p}.{name}", value, "0 or more, and at most 1e6")
 
 
 @dataclass(frozen=True)
@@ -128,8 +134,8 @@ class EvaluationConfig:
 
     def __post_init__(self) -> None:
         p = "evaluation"
-        require_finite_numbers(self, p)
-        require(self.every_decisions >= 1, f"{p}.every_decisions", self.every_decisions, "1 or more")
+        require_types(self, p)
+        require(1 <= self.every_decisions <= 10**12, f"{p}.every_decisions", self.every_decisions, "in [1, 10^12]")
         require(1 <= self.episodes <= 10**7, f"{p}.episodes", self.episodes, "in [1, 10000000]")
         require(1 <= self.num_slots <= 10**5, f"{p}.num_slots", self.num_slots, "in [1, 100000]")
         require(self.rocks is None or self.rocks >= 0, f"{p}.rocks", self.rocks, "0 or more, or None")
@@ -166,6 +172,8 @@ class TrainConfig:
     process_id: int = 0
     """Which of them this is, from 0."""
     checkpoint_every_updates: int = 8
+    max_bad_updates: int = 10
+    """Updates in a row with a loss or gradient that is not finite (such steps are skipped), after which a run stops."""
     loggers: tuple[LoggerName, ...] = ()
     """wandb, mlflow: who gets the numbers besides metrics.jsonl and TensorBoard. Offline, unless WANDB_MODE or
     MLFLOW_TRACKING_URI say otherwise; each is an extra of the package."""
@@ -194,43 +202,37 @@ class TrainConfig:
         return -(-self.steps // self.ppo.decisions_per_update)
 
     def __post_init__(self) -> None:
-        require_choice(self.arch, Arch, "arch")
-        require_choice(self.preset, PresetName, "preset")
+        require_types(self)
         for logger in self.loggers:
             require_choice(logger, LoggerName, "loggers")
         require(len(set(self.loggers)) == len(self.loggers), "loggers", self.loggers, "each of them once")
-        for name in (
-            "seed",
-            "steps",
-            "num_seeds",
-            "num_devices",
-            "num_processes",
-            "process_id",
-            "checkpoint_every_updates",
-        ):
-            value = getattr(self, name)
-            require(type(value) is int, name, value, "a whole number")
         require(0 <= self.seed < 2**31, "seed", self.seed, "in [0, 2^31)")
         require(1 <= self.num_seeds <= 1024, "num_seeds", self.num_seeds, "in [1, 1024]")
-        require(1 <= self.steps <= 10**12, "steps", self.steps, "in [1, 10^12]")
-        require(
-            self.checkpoint_every_updates >= 1, "checkpoint_every_updates", self.checkpoint_every_updates, "1 or more"
-        )
+        should = f"in [0, {2**31 - self.num_seeds}], so that every one of num_seeds = {self.num_seeds} is below 2^31"
+        require(self.seed + self.num_seeds <= 2**31, "seed", self.seed, should)
+        for name in ("steps", "checkpoint_every_updates", "max_bad_updates"):
+            require(1 <= getattr(self, name) <= 10**12, name, getattr(self, name), "in [1, 10^12]")
         self._require_even_shares()
-        is_plain = (
-            isinstance(self.run, str) and "/" not in self.run and self.run not in (".", "..") and "\0" not in self.run
-        )
-        require(is_plain, "run", self.run, "a folder's name without slashes")
+        is_name = "/" not in self.run and self.run not in (".", "..") and self.run == self.run.strip()
+        is_name = is_name and len(self.run.encode()) <= LONGEST_NAME_BYTES
+        require(is_name, "run", self.run, f"a folder's name without slashes, at most {LONGEST_NAME_BYTES} bytes long")
+        require(len(self.runs_dir) > 0, "runs_dir", self.runs_dir, "a folder; . is this one")
+        for name in ("runs_dir", "start_from"):
+            require(is_path(getattr(self, name)), name, getattr(self, name), A_PATH)
         self._require_room_for_validation_rocks()
         seen = ARCH_OBSERVATION[self.arch]
         require(self.env.obs == seen, "env.obs", self.env.obs, f"{seen} for arch {self.arch}")
 
     def _require_even_shares(self) -> None:
         require(self.num_processes >= 1, "num_processes", self.num_processes, "1 or more")
+        for name in ("num_processes", "num_devices"):
+            count = getattr(self, name)
+            require(count <= MOST_DEVICES, name, count, f"at most {MOST_DEVICES}")
         should = f"in [0, {self.num_processes}), the number of processes"
         require(0 <= self.process_id < self.num_processes, "process_id", self.process_id, should)
         host, colon, port = self.coordinator.rpartition(":")
-        is_address = bool(host and colon and port.isdigit())
+        is_port = port.isascii() and port.isdigit() and len(port) <= 5 and 0 < int(port) < 2**16
+        is_address = bool(host and colon and is_port)
         if self.num_processes > 1 or self.coordinator:
             require(is_address, "coordinator", self.coordinator, "HOST:PORT of process 0")
         per_minibatch = self.ppo.num_envs // self.ppo.num_minibatches

@@ -4,9 +4,10 @@ import dataclasses
 import difflib
 from typing import Any, TypeVar
 
-from segvisrl_jax.config.checks import ConfigError, require
+from segvisrl_jax.config.checks import ConfigError, require, shown
 
 ConfigT = TypeVar("ConfigT")
+LONGEST_FIELD = 100  # characters of an unknown name that a message repeats
 
 
 def replace_fields(config: ConfigT, **values: Any) -> ConfigT:
@@ -26,7 +27,9 @@ def replace_fields(config: ConfigT, **values: Any) -> ConfigT:
             continue
         inside = {key: values.pop(key) for key in list(values) if key in _field_names(part)}
         if inside:
-            here[name] = replace_fields(here.get(name, part), **inside)
+            whole = here.get(name, part)
+            require(isinstance(whole, type(part)), name, whole, f"a {type(part).__name__}")
+            here[name] = replace_fields(whole, **inside)
     if values:
         _refuse_unknown(next(iter(values)), _field_names(config))
     return dataclasses.replace(config, **here)  # type: ignore[type-var]
@@ -45,7 +48,7 @@ def _field_names(config: Any) -> list[str]:
 def _refuse_unknown(name: str, known: list[str]) -> None:
     near = difflib.get_close_matches(name, known, n=3)
     hint = f"did you mean {' or '.join(near)}?" if near else "known: " + ", ".join(sorted(known))
-    raise ConfigError(f"{name}: no such setting; {hint}")
+    raise ConfigError(f"{name[:LONGEST_FIELD]}: no such setting; {hint}")
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -68,7 +71,9 @@ def from_dict(kind: type[ConfigT], data: Any, where: str = "config") -> ConfigT:
     known = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
     values = {}
     for name, value in data.items():
-        require(name in known, f"{where}.{name}", value, "left out: no such setting")
+        if name not in known:
+            field = name if name.isidentifier() else shown(name)
+            require(False, f"{where}.{field[:LONGEST_FIELD]}", value, "left out: no such setting")
         part = known[name].default_factory
         is_part = part is not dataclasses.MISSING
         value = tuple(value) if isinstance(value, list) else value

@@ -3,6 +3,7 @@
 Benchmarks give their figures as shares of the best.
 """
 
+import math
 import statistics
 import time
 from collections.abc import Callable
@@ -29,8 +30,11 @@ def flop_of(work: Callable[..., Any], *given: Any) -> float:
     return float(counted["flops"])
 
 
-def time_calls(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
-    """(seconds of the first call, median seconds of a call). Short calls are timed several at a time."""
+def time_calls(call: Callable[[], Any], repeats: int, enough_s: float = math.inf) -> tuple[float, float]:
+    """(seconds of the first call, median seconds of a call). Short calls are timed several at a time.
+
+    A second call that takes ``enough_s`` is not repeated.
+    """
 
     def seconds(calls: int) -> float:
         began = time.perf_counter()
@@ -39,5 +43,7 @@ def time_calls(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
         return (time.perf_counter() - began) / calls
 
     first, second = seconds(1), seconds(1)
+    if second >= enough_s:
+        return first, second
     calls = max(1, round(LEAST_TIMED_S / second))
     return first, statistics.median(seconds(calls) for _ in range(repeats))

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,7 +10,8 @@ from segvisrl_jax.machine.finding import GIB, Finding
 from segvisrl_jax.machine.programs import programs_folder
 
 SECTION = "this machine"
-CGROUP = Path("/sys/fs/cgroup")
+CGROUP, MEMINFO = Path("/sys/fs/cgroup"), Path("/proc/meminfo")
+NO_LIMIT = 2**60  # bytes; control groups of version 1 say so many where there is no limit
 LEAST_MEMORY_GIB = 4.0  # training takes 1 to 3 GiB with the preset cpu, most of it while compiling
 LEAST_DISK_GIB = 1.0  # a run takes some 20 MB, and compiled kernels and videos come on top
 BUSY_SHARE = 0.5  # of the cores: above it, what is measured here is not what the machine can do
@@ -42,16 +44,56 @@ def _quota(cgroup: Path) -> float | None:
     return int(words[0]) / int(words[1])
 
 
-def free_memory_bytes(cgroup: Path = CGROUP, meminfo: Path = Path("/proc/meminfo")) -> int | None:
+def free_memory_bytes(cgroup: Path = CGROUP, meminfo: Path = MEMINFO) -> int | None:
     """What the system and a container's limit leave; None where neither tells."""
-    free = []
-    for line in (_read(meminfo) or "").splitlines():
-        if line.startswith("MemAvailable:"):
-            free.append(int(line.split()[1]) * 1024)
-    limit, used = _read(cgroup / "memory.max"), _read(cgroup / "memory.current")
-    if limit and used and limit.isdigit():
-        free.append(int(limit) - int(used))
+    limit, used = _container_memory(cgroup)
+    left = None if limit is None or used is None else max(0, limit - used)
+    free = [size for size in (_memory_of(meminfo, "MemAvailable"), left) if size is not None]
     return min(free, default=None)
+
+
+def all_memory_bytes(cgroup: Path = CGROUP, meminfo: Path = MEMINFO) -> int | None:
+    """What the machine has, or a container's limit, or the limit of this process (``ulimit -v``); None: unknown."""
+    sizes = [_memory_of(meminfo, "MemTotal"), _container_memory(cgroup)[0], _process_limit()]
+    return min((size for size in sizes if size is not None), default=None)
+
+
+def peak_resident_bytes(status: Path = Path("/proc/self/status")) -> int:
+    """The most that this process has had in memory."""
+    told = _memory_of(status, "VmHWM")  # getrusage would count the parent's, before this program was started in it
+    if told is not None:
+        return told
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def _memory_of(meminfo: Path, name: str) -> int | None:
+    lines = [line for line in (_read(meminfo) or "").splitlines() if line.startswith(f"{name}:")]
+    return int(lines[0].split()[1]) * 1024 if lines else None
+
+
+def _container_memory(cgroup: Path) -> tuple[int | None, int | None]:
+    """(limit, used) in either version of Linux's control groups; cached files that can go count as free."""
+    first = (cgroup / "memory" / "memory.limit_in_bytes", cgroup / "memory" / "memory.usage_in_bytes")
+    for limit_file, used_file in ((cgroup / "memory.max", cgroup / "memory.current"), first):
+        limit, used = _read(limit_file), _read(used_file)
+        if not (limit and used and limit.isdigit()) or int(limit) >= NO_LIMIT:  # "max" stands for no limit
+            continue
+        counts = dict(line.split() for line in (_read(used_file.with_name("memory.stat")) or "").splitlines())
+        files = int(counts.get("total_inactive_file", counts.get("inactive_file", 0)))
+        return int(limit), max(0, int(used) - files)
+    return None, None
+
+
+def _process_limit() -> int | None:
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return None
+    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return None if soft == resource.RLIM_INFINITY else soft
 
 
 def _read(path: Path) -> str | None:

@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from segvisrl_jax.config import require
-from segvisrl_jax.training.metrics import METRICS_FILE, STEP_KEY, read_metrics
+from segvisrl_jax.training.metrics import METRICS_FILE, STEP_KEY
+from segvisrl_jax.training.metrics_rows import read_rows
 
 DOTS_PER_INCH = 100  # so a figure of 10 inches is 1000 pixels wide
 SHARP_DOTS_PER_INCH = 160  # of the figures of the results page, which are read closely
@@ -80,8 +81,7 @@ _RIGHT_LABELS = ("return of an episode", "entropy [nat]", "explained variance")
 
 def _read_run(run_dir: Path) -> Run:
     """Reads a run's lines into columns."""
-    path = run_dir / METRICS_FILE
-    rows = read_metrics(run_dir) if path.exists() else []
+    rows = read_rows(run_dir)
     require(len(rows) > 0, "run_dir", str(run_dir), f"a run's folder, with lines in {METRICS_FILE}")
     keys = {key for row in rows for key in row}
     columns = {key: np.array([_as_float(row.get(key)) for row in rows]) for key in keys}

@@ -18,11 +18,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from segvisrl_jax.config import ConfigError, TrainConfig, from_dict, require
+from segvisrl_jax.config import ConfigError, TrainConfig, from_dict, is_plain_text, read_json, require
 from segvisrl_jax.report.figures import SHARP_DOTS_PER_INCH, clear_frame, save_figure
 from segvisrl_jax.report.lines import BAND_ALPHA, LineEnd, method_colours, name_ends
 from segvisrl_jax.report.recipe import recipe
-from segvisrl_jax.training.metrics import METRICS_FILE, STEP_KEY, read_metrics
+from segvisrl_jax.training.metrics import METRICS_FILE, STEP_KEY
+from segvisrl_jax.training.metrics_rows import MOST_DECISIONS, read_rows
 
 POINTS = 200  # of a run's return at most: more than a figure can show
 LOG_FROM = 4.0  # the longest run over the shortest, from which on decisions are on a logarithmic axis
@@ -84,10 +85,13 @@ def _run_curve(run_dir: Path) -> Curve:
     config_file = run_dir / "config.json"
     require(config_file.is_file(), "RUN", str(run_dir), f"a run's folder, with {config_file.name} and {METRICS_FILE}")
     try:
-        config = from_dict(TrainConfig, json.loads(config_file.read_text()))
-    except ValueError as error:
+        config = from_dict(TrainConfig, read_json(config_file))
+    except (OSError, ValueError) as error:
         raise ConfigError(f"{config_file}: not a run's settings ({error})") from None
-    rows = read_metrics(run_dir) if (run_dir / METRICS_FILE).is_file() else []
+    try:
+        rows = read_rows(run_dir)
+    except ConfigError as error:
+        raise ConfigError(f"{run_dir}: {error}") from None
     returns, success = _series(rows, RETURN_KEY), _series(rows, SUCCESS_KEY)
     require(len(returns.values) > 0, "RUN", str(run_dir), f"a run with episodes ({RETURN_KEY}) in {METRICS_FILE}")
     name = run_dir.resolve().name
@@ -140,11 +144,19 @@ def _csv_curves(path: Path) -> list[Curve]:
         for row in rows:
             numbers = {name: float(row[name]) for name in ("return", "success") if row[name]}
             key = (row["arch"], row["recipe"], row["run"], int(row["seed"]))
-            runs.setdefault(key, []).append({STEP_KEY: float(row["decisions"]), **numbers})
+            decisions = float(row["decisions"])
+            require(0 <= decisions <= MOST_DECISIONS, "decisions", decisions, f"in [0, {MOST_DECISIONS:.0e}]")
+            require(all(map(is_plain_text, key[:3])), "arch, recipe, run", key[:3], "text without control characters")
+            runs.setdefault(key, []).append({STEP_KEY: decisions, **numbers})
     except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:
         raise ConfigError(f"{path}: should be a .csv with {', '.join(COLUMNS)} ({error})") from None
     require(len(runs) > 0, "RUN", str(path), "a .csv that holds at least one run")
-    return [Curve(str(path), *key, _series(lines, "return"), _series(lines, "success")) for key, lines in runs.items()]
+    curves = [
+        Curve(str(path), *key, _series(lines, "return"), _series(lines, "success")) for key, lines in runs.items()
+    ]
+    has_returns = all(len(curve.returns.values) > 0 for curve in curves)
+    require(has_returns, "RUN", str(path), "a .csv with returns of every run")
+    return curves
 
 
 def methods_of(curves: Sequence[Curve]) -> dict[str, list[Curve]]:

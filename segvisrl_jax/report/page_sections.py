@@ -17,7 +17,7 @@ from segvisrl_jax.report.page_recording import Driver, Recordings
 from segvisrl_jax.report.page_settings import settings_of
 from segvisrl_jax.report.scene_figures import map_windows
 from segvisrl_jax.report.table import Evaluation
-from segvisrl_jax.training.metrics import METRICS_FILE, read_metrics
+from segvisrl_jax.training.metrics_rows import read_rows
 
 SECONDS_KEY = "time/seconds"
 
@@ -117,7 +117,7 @@ def run_facts(driver: Driver, evaluation: Evaluation) -> RunFacts:
     assert run is not None
     differing, same = settings_of(config)
     line = f"{config.arch}, preset {config.preset}, seed {config.seed}, {config.steps:,} decisions"
-    rows = read_metrics(run) if (run / METRICS_FILE).is_file() else []
+    rows = read_rows(run)
     seconds = rows[-1].get(SECONDS_KEY) if rows else None
     if seconds is not None:
         line += f" in {seconds / 60:,.0f} minutes" if seconds >= 60 else f" in {seconds:.0f} s"

@@ -3,8 +3,6 @@
 It reads settings and numbers as plain data, so that runs of other versions are listed too. It prints nothing.
 """
 
-import json
-import math
 import statistics
 import time
 from collections.abc import Iterator
@@ -12,14 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from segvisrl_jax.training.loggers import METRICS_FILE, STEP_KEY, is_being_written, read_metrics
+from segvisrl_jax.config import is_finite, is_plain_text, read_json, require
+from segvisrl_jax.training.loggers import METRICS_FILE, STEP_KEY
+from segvisrl_jax.training.metrics_rows import MOST_DECISIONS, read_rows
+from segvisrl_jax.training.run_lock import is_being_trained
 
 State = Literal["finished", "running", "stopped"]
 CONFIG_FILE, TEST_FILE = "config.json", "eval.json"
 LEAST_PATIENCE_S = 300.0  # a run that nobody locks counts as running for this long after its last line,
 PATIENCE_UPDATES = 5  # or for as long as this many updates take: an evaluation lies between two lines
 RECENT_LINES = 10  # what the time of an update is taken from
-WHAT_READING_RAISES = (OSError, ValueError, KeyError, TypeError, AttributeError, ZeroDivisionError)
+WHAT_READING_RAISES = (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError)
 
 
 @dataclass(frozen=True)
@@ -108,30 +109,30 @@ def _why_no_run(path: Path) -> str:
 
 def _summary(name: str, path: Path, test: Score | None) -> RunSummary:
     config = _object(path / CONFIG_FILE)
-    per_update = config["ppo"]["num_envs"] * config["ppo"]["unroll_length"]
-    asked = math.ceil(config["steps"] / per_update) * per_update
-    rows = _metrics(path)
+    per_update = _whole(config["ppo"], "num_envs", 1) * _whole(config["ppo"], "unroll_length", 1)
+    asked = -(-_whole(config, "steps", 1) // per_update) * per_update
+    rows = read_rows(path)
     done = int(rows[-1][STEP_KEY]) if rows else 0
     file = path / METRICS_FILE
     changed_s = (file if file.exists() else path / CONFIG_FILE).stat().st_mtime
     return RunSummary(
         name=name,
-        arch=str(config["arch"]),
-        preset=str(config["preset"]),
-        seed=int(config["seed"]),
+        arch=_text(config, "arch"),
+        preset=_text(config, "preset"),
+        seed=_whole(config, "seed", 0),
         decisions=done,
         decisions_asked=asked,
         state=_state(path, rows, done, asked, per_update, changed_s),
         held_out=_best(rows),
         test=test,
-        hours=float(rows[-1].get("time/seconds", 0.0)) / 3600 if rows else 0.0,
+        hours=_number(rows[-1], "time/seconds") / 3600 if rows and "time/seconds" in rows[-1] else 0.0,
         changed_s=changed_s,
     )
 
 
 def _object(path: Path) -> dict[str, Any]:
     try:
-        data = json.loads(path.read_text())
+        data = read_json(path)
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from None
     if not isinstance(data, dict):
@@ -139,27 +140,32 @@ def _object(path: Path) -> dict[str, Any]:
     return data
 
 
-def _metrics(path: Path) -> list[dict[str, Any]]:
-    """The lines so far; none before the first is written."""
-    if not (path / METRICS_FILE).is_file():
-        return []
-    try:
-        rows = read_metrics(path)
-    except ValueError as error:
-        raise ValueError(f"{METRICS_FILE}: {error}") from None
-    for number, row in enumerate(rows, start=1):
-        if not isinstance(row, dict) or not isinstance(row.get(STEP_KEY), int):
-            raise ValueError(f"{METRICS_FILE}: line {number} has no step")
-    return rows
+def _whole(data: dict[str, Any], name: str, least: int) -> int:
+    value = data[name]
+    is_whole = type(value) is int and least <= value <= MOST_DECISIONS
+    require(is_whole, name, value, f"a whole number in [{least}, {MOST_DECISIONS:.0e}]")
+    return value
+
+
+def _number(data: dict[str, Any], name: str) -> float:
+    value = data[name]
+    require(is_finite(value), name, value, "a finite number")
+    return float(value)
+
+
+def _text(data: dict[str, Any], name: str) -> str:
+    value = data[name]
+    require(is_plain_text(value), name, value, "text without control characters")
+    return value
 
 
 def _state(path: Path, rows: list[dict[str, Any]], done: int, asked: int, per_update: int, changed_s: float) -> State:
-    """Running: a process of this machine holds the metrics file, or its last line is fresh and no end has been saved.
+    """Running: a process of this machine holds its folder, or its last line is fresh and no end has been saved.
 
     The second is for runs on another machine whose folder is shared. A run that ends early saves a checkpoint behind
     its last line, and so cannot be taken for a running one.
     """
-    if is_being_written(path):
+    if is_being_trained(path):
         return "running"
     if done >= asked:
         return "finished"
@@ -172,7 +178,7 @@ def _state(path: Path, rows: list[dict[str, Any]], done: int, asked: int, per_up
 
 def _best(rows: list[dict[str, Any]]) -> Score | None:
     """The evaluation that training kept the policy of: most successes, then fewest collisions, then shortest paths."""
-    evaluated = [row for row in rows if row.get("evaluation/success") is not None]
+    evaluated = [row for row in rows if is_finite(row.get("evaluation/success"))]
     if not evaluated:
         return None
 
@@ -182,6 +188,8 @@ def _best(rows: list[dict[str, Any]]) -> Score | None:
 
     best = max(evaluated, key=rank)
     low, high = (best.get(f"evaluation/success_{end}") for end in ("low", "high"))
+    has_interval = is_finite(low) and is_finite(high)
+    low, high = (low, high) if has_interval else (None, None)
     return Score(float(best["evaluation/success"]), low, high, best[STEP_KEY])
 
 
@@ -191,7 +199,9 @@ def _test_score(path: Path) -> Score | None:
         return None
     data = _object(path / TEST_FILE)
     low, high = data["success_ci95"]
-    return Score(float(data["success"]), float(low), float(high), int(data["episodes"]))
+    interval = {"low": low, "high": high}
+    success, episodes = _number(data, "success"), _whole(data, "episodes", 1)
+    return Score(success, _number(interval, "low"), _number(interval, "high"), episodes)
 
 
 def _one_line(error: Exception) -> str:

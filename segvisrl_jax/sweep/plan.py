@@ -6,13 +6,12 @@ Owns names, options and checks of the trials. Running them is the engines' task.
 import dataclasses
 import difflib
 import itertools
-import json
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from segvisrl_jax.config import ConfigError, TrainConfig, flatten, require, to_dict
+from segvisrl_jax.config import ConfigError, TrainConfig, flatten, read_json, require, to_dict
 
 NOT_COMPARED = ("run", "runs_dir", "resume", "loggers")  # what a run that goes on may have otherwise
 BY_VALUE = ("arch", "preset")  # fields whose values say what they are: "cnn", not "archcnn"
@@ -137,8 +136,10 @@ def _check_same_settings(config: TrainConfig, file: Path) -> None:
     if not file.is_file():
         return
     try:
-        stored = flatten(json.loads(file.read_text()))
-    except ValueError as error:
+        data = read_json(file)
+        require(isinstance(data, dict), "content", type(data).__name__, "an object")
+        stored = flatten(data)
+    except (OSError, ValueError) as error:
         raise ConfigError(f"{file}: not a run's settings ({error})") from None
     asked = flatten(to_dict(config))
     for name, value in asked.items():

@@ -1,13 +1,13 @@
 """What a sweep found: one row for each trial, as a CSV file and in words."""
 
 import csv
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from segvisrl_jax.config import ConfigError, is_finite, read_json, require
 from segvisrl_jax.sweep.plan import Trial
-from segvisrl_jax.training.metrics import read_metrics
+from segvisrl_jax.training.metrics_rows import read_rows
 
 SCORES = ("success", "success_low", "success_high", "collision", "fall", "timeout", "spl", "decisions_per_second")
 DONE = "done"
@@ -20,12 +20,25 @@ def result_row(trial: Trial, run_dir: Path, status: str, node: str) -> dict[str,
 
 
 def _scores(run_dir: Path) -> dict[str, float]:
-    result = json.loads((run_dir / "eval.json").read_text())
-    low, high = result["success_ci95"]
-    last = read_metrics(run_dir)[-1]
-    speed = last["step"] / last["time/seconds"]
-    kept = {name: result[name] for name in SCORES if name in result}
-    return {**kept, "success_low": low, "success_high": high, "decisions_per_second": speed}
+    file = run_dir / "eval.json"
+    try:
+        result = read_json(file)
+        low, high = result["success_ci95"]
+        last = read_rows(run_dir)[-1]
+        speed = last["step"] / last["time/seconds"]
+        kept = {name: result[name] for name in SCORES if name in result}
+        scores = {
+            "success": result["success"],
+            **kept,
+            "success_low": low,
+            "success_high": high,
+            "decisions_per_second": speed,
+        }
+        for name, value in scores.items():
+            require(is_finite(value), name, value, "a finite number")
+    except (OSError, ValueError, KeyError, IndexError, TypeError, ArithmeticError) as error:
+        raise ConfigError(f"{run_dir}: not a finished run ({error}); remove it, and it is trained again") from None
+    return scores
 
 
 def write_csv(path: Path, trials: Sequence[Trial], rows: Sequence[dict[str, Any]]) -> None:

@@ -1,12 +1,15 @@
 """What a run leaves on disk: checkpoints to go on from (orbax), and policies to drive with (JSON and NumPy arrays).
 
 A checkpoint holds everything: parameters, optimizer, environments, memory, keys, counters. A policy folder holds
-``policy.json`` (configuration, scores) and ``params.npz``; loading either runs no code from the file.
+``policy.json`` (configuration, scores) and the file of parameters that it names. Both carry checksums, and what does
+not agree with them is not read; loading runs no code from a file.
 """
 
+import contextlib
 import dataclasses
 import json
-import os
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +18,44 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from segvisrl_jax.assets import asset_dir
-from segvisrl_jax.config import ConfigError, TrainConfig, from_dict, to_dict
+from segvisrl_jax.config import ConfigError, TrainConfig, from_dict, read_json, to_dict
+from segvisrl_jax.training.manifest import (
+    MANIFEST,
+    library_versions,
+    read_manifest,
+    replace_file,
+    require_sha256,
+    sha256_of,
+    sha256_of_json,
+    write_manifest,
+)
+from segvisrl_jax.training.processes import Processes
 
 CHECKPOINTS_KEPT = 2
-POLICY_FORMAT = 1
+POLICY_FORMAT = FIRST_WITH_CHECKSUMS = 2  # before: the parameters in params.npz
+SETTINGS_FILE = "config.json"  # of the run
+DAMAGED_FOLDER = "damaged"  # where checkpoints go that cannot be read
+UNFINISHED, FOREIGN = "was not finished", "was made with other settings than the run has"
 
 
 class Checkpoints:
-    """The checkpoints of one run, by number of updates; the last ones are kept. Writing is atomic (orbax)."""
+    """The checkpoints of one run, by number of updates; the last ones are kept. Writing is atomic.
 
-    def __init__(self, run_dir: Path):
+    Opening looks at what is there: what was not finished is removed, what is damaged is set aside, and ``say`` is told.
+
+    Raises:
+        ConfigError: where checkpoints are there and none is whole, or all belong to other settings than the run's.
+    """
+
+    def __init__(self, run_dir: Path, processes: Processes | None = None, say: Callable[[str], None] = print):
+        self._run_dir, self._processes, self._say = Path(run_dir), processes or Processes(), say
+        self._folder = (self._run_dir / "checkpoints").resolve()
+        self._processes.on_first(self._keep_whole_ones)
+        self._manager = self._open()
+
+    def _open(self) -> ocp.CheckpointManager:
         options = ocp.CheckpointManagerOptions(max_to_keep=CHECKPOINTS_KEPT, enable_async_checkpointing=False)
-        self._manager = ocp.CheckpointManager((run_dir / "checkpoints").resolve(), options=options)
+        return ocp.CheckpointManager(self._folder, options=options)
 
     @property
     def latest(self) -> int | None:
@@ -34,11 +63,32 @@ class Checkpoints:
         return self._manager.latest_step()
 
     def save(self, updates: int, state: Any, host: dict[str, Any]) -> None:
-        """Writes a pytree of arrays and keys, and JSON data that lives on the host."""
+        """Writes a pytree of arrays and keys, and JSON data that lives on the host.
+
+        Raises:
+            Exception: of many kinds where the disk is full or the folder is gone; those from before are still there.
+        """
         if updates == self.latest:
             return
         args = ocp.args.Composite(state=ocp.args.StandardSave(_stored(state)), host=ocp.args.JsonSave(host))
-        self._manager.save(updates, args=args)
+        try:
+            self._manager.save(updates, args=args)
+            if self._processes.is_first:
+                about = {"updates": updates, "settings": self._settings(), "versions": library_versions()}
+                write_manifest(self._folder / str(updates), about)
+        except Exception:
+            if self._processes.count == 1:
+                self._start_again(updates)
+            raise
+
+    def _start_again(self, updates: int) -> None:
+        """Drops what a failed write left, and the manager, which counts it as written."""
+        with contextlib.suppress(Exception):
+            self._manager.close()
+        for left in self._folder.glob(f"{updates}*"):
+            shutil.rmtree(left, ignore_errors=True)
+        with contextlib.suppress(Exception):  # the folder may be gone for good: the next write says so
+            self._manager = self._open()
 
     def restore_latest(self, like: Any) -> tuple[Any, dict[str, Any]]:
         """Reads the newest checkpoint; see ``restore``.
@@ -47,7 +97,7 @@ class Checkpoints:
             ConfigError: where there is none, or it does not fit.
         """
         if self.latest is None:
-            raise ConfigError(f"{self._manager.directory}: holds no checkpoint; leave --resume out and start again")
+            raise ConfigError(f"{self._folder}: holds no checkpoint; leave --resume out and start again")
         return self.restore(self.latest, like)
 
     def restore(self, updates: int, like: Any) -> tuple[Any, dict[str, Any]]:
@@ -60,16 +110,62 @@ class Checkpoints:
         args = ocp.args.Composite(state=ocp.args.StandardRestore(target), host=ocp.args.JsonRestore())
         try:
             found = self._manager.restore(updates, args=args)
-        except (ValueError, KeyError, TypeError, FileNotFoundError) as error:
+        except Exception as error:  # a file without a checksum may fail to be read in any way
             reason = " ".join(str(error).split())[:200]
-            raise ConfigError(
-                f"checkpoint {self._manager.directory}/{updates} does not fit these settings: {reason}"
-            ) from None
+            raise ConfigError(f"checkpoint {self._folder}/{updates} does not fit these settings: {reason}") from None
         return _restored(found["state"], like), found["host"]
 
     def close(self) -> None:
         """Waits for writes and lets go of the folder."""
         self._manager.close()
+
+    def _settings(self) -> str | None:
+        """The checksum of the run's settings; None where they are not in a file."""
+        path = self._run_dir / SETTINGS_FILE
+        return sha256_of(path) if path.is_file() else None
+
+    def _keep_whole_ones(self) -> None:
+        """Leaves the newest whole checkpoint as the newest one."""
+        found = sorted(
+            (path for path in self._folder.glob("*") if path.name.isdigit()), key=lambda path: -int(path.name)
+        )
+        if found and not any((path / MANIFEST).exists() for path in found):
+            self._say(f"{self._folder}: the checkpoints have no checksums, as those of earlier versions")
+            return
+        complaints = {path: self._complaint(path) for path in found}
+        if complaints and all(complaint == FOREIGN for complaint in complaints.values()):
+            raise ConfigError(
+                f"{self._run_dir / SETTINGS_FILE}: is not what its checkpoints were made with: changed, or damaged"
+            )
+        refused = []
+        for path, complaint in complaints.items():
+            if complaint is None:
+                break
+            refused.append(complaint)
+            self._remove(path, complaint)
+        if refused and len(refused) == len(found) and any(complaint != UNFINISHED for complaint in refused):
+            raise ConfigError(f"no whole checkpoint is left: {'; '.join(refused)}")
+
+    def _complaint(self, path: Path) -> str | None:
+        """What keeps a checkpoint from being used."""
+        if not (path / MANIFEST).exists():
+            return UNFINISHED
+        try:
+            about = read_manifest(path)
+        except ValueError as error:
+            return str(error)
+        return None if about.get("settings") == self._settings() else FOREIGN
+
+    def _remove(self, path: Path, complaint: str) -> None:
+        if complaint == UNFINISHED:
+            shutil.rmtree(path)
+            self._say(f"the checkpoint of update {path.name} was not finished; it is gone")
+            return
+        aside = self._run_dir / DAMAGED_FOLDER / path.name
+        shutil.rmtree(aside, ignore_errors=True)
+        aside.parent.mkdir(exist_ok=True)
+        path.rename(aside)
+        self._say(f"warning: the checkpoint of update {path.name} is not used ({complaint}); it is in {aside} now")
 
 
 def _is_key(leaf: Any) -> bool:
@@ -116,13 +212,25 @@ def _without_folders(config: TrainConfig) -> TrainConfig:
 
 
 def save_policy(folder: Path, config: TrainConfig, params: Any, scores: dict[str, Any]) -> None:
-    """Writes a policy folder; an older one of the same name is replaced file by file, each in one move."""
+    """Writes a policy folder, or a newer policy in place of the one there: whenever it ends, one of them is whole."""
     folder.mkdir(parents=True, exist_ok=True)
     flat = {"/".join(path): np.asarray(leaf) for path, leaf in _leaves(jax.device_get(params))}
-    _replace(folder / "params.npz", lambda file: np.savez(file, **flat))  # type: ignore[arg-type]
-    card = {"format": POLICY_FORMAT, "config": to_dict(_without_folders(config)), "scores": scores}
-    text = json.dumps(card, indent=2) + "\n"
-    _replace(folder / "policy.json", lambda file: file.write(text.encode()))
+    partial = folder / "params.npz"
+    replace_file(partial, lambda file: np.savez(file, **flat))  # type: ignore[arg-type]
+    digest = sha256_of(partial)
+    params_file = partial.rename(folder / f"params-{digest[:8]}.npz")
+    card = {
+        "format": POLICY_FORMAT,
+        "params": {"file": params_file.name, "sha256": digest},
+        "versions": library_versions(),
+        "config": to_dict(_without_folders(config)),
+        "scores": scores,
+    }
+    text = json.dumps(card | {"sha256": sha256_of_json(card)}, indent=2) + "\n"
+    replace_file(folder / "policy.json", lambda file: file.write(text.encode()))
+    for older in folder.glob("params*.npz"):
+        if older != params_file:
+            older.unlink()
 
 
 def load_policy(folder: Path) -> tuple[TrainConfig, Any, dict[str, Any]]:
@@ -135,18 +243,36 @@ def load_policy(folder: Path) -> tuple[TrainConfig, Any, dict[str, Any]]:
         ConfigError: where it is missing or damaged; the message names the file.
     """
     folder = _find_policy(Path(folder))
-    card_file, params_file = folder / "policy.json", folder / "params.npz"
-    try:
-        card = json.loads(card_file.read_text())
-        config, scores = from_dict(TrainConfig, card["config"]), card["scores"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ConfigError(f"{card_file}: not a policy's card ({error})") from None
+    config, scores, params_file = _read_card(folder / "policy.json")
     try:
         with np.load(params_file, allow_pickle=False) as arrays:
             params = _nest({name: arrays[name] for name in arrays.files})
     except Exception as error:  # a damaged zip raises many kinds; all mean the same to the user
         raise ConfigError(f"{params_file}: cannot be read ({error})") from None
     return config, params, scores
+
+
+def _read_card(path: Path) -> tuple[TrainConfig, dict[str, Any], Path]:
+    """(settings, scores, the file of the parameters) of a policy; what has checksums agrees with them."""
+    try:
+        card = read_json(path)
+        version, checksum = int(card["format"]), card.pop("sha256", None)
+        if version <= POLICY_FORMAT and (version < FIRST_WITH_CHECKSUMS or checksum == sha256_of_json(card)):
+            config, scores = from_dict(TrainConfig, card["config"]), card["scores"]
+            params = card["params"] if version >= FIRST_WITH_CHECKSUMS else {"file": "params.npz"}
+            params_file = path.parent / Path(params["file"]).name
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(f"{path}: not a policy's card ({error})") from None
+    if version > POLICY_FORMAT:
+        raise ConfigError(f"{path}: was written by a newer version of segvisrl_jax (format {version})")
+    if version >= FIRST_WITH_CHECKSUMS:
+        if checksum != sha256_of_json(card):
+            raise ConfigError(f"{path}: is damaged, or was edited (its checksum is another)")
+        try:
+            require_sha256(params_file, params["sha256"])
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
+    return config, scores, params_file
 
 
 def _find_policy(folder: Path) -> Path:
@@ -177,13 +303,3 @@ def _nest(flat: dict[str, np.ndarray]) -> dict[str, Any]:
             here = here.setdefault(part, {})
         here[last] = array
     return nested
-
-
-def _replace(path: Path, write) -> None:
-    """Writes beside the file, then moves over it, so that no half-written file is ever read."""
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)

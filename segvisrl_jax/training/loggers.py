@@ -4,15 +4,17 @@
 are in ``trackers``, the display on the screen in ``metrics``.
 """
 
-import contextlib
 import json
-import os
+import time
 from collections.abc import Callable, Mapping
+from io import FileIO
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
+
+from segvisrl_jax.training.manifest import replace_file
 
 if TYPE_CHECKING:
-    from tensorboardX import SummaryWriter
+    from tensorboardX.event_file_writer import EventsWriter
 
 METRICS_FILE = "metrics.jsonl"
 TENSORBOARD_FOLDER = "tensorboard"
@@ -37,42 +39,87 @@ class Logger(Protocol):
 class JsonLines:
     """``metrics.jsonl``: a line is one JSON object with ``step`` and the numbers, on disk when ``log`` returns.
 
-    An existing file is continued; a line that a crash cut off is dropped. While it is open the file is locked, so that
-    others can see that the run is alive (``is_being_written``).
+    An existing file is continued; a line that a crash cut off or that is damaged is dropped. What could not be written
+    is written with the next line; a file that vanished is written again, whole.
     """
 
     def __init__(self, run_dir: Path) -> None:
         self._path = Path(run_dir) / METRICS_FILE
-        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._waiting: list[bytes] = []
+        self.num_dropped = 0  # lines that were damaged
         self._file = self._open(lambda row: True)
+        self._size = self._path.stat().st_size  # of the whole lines in it
 
     def resume_at(self, step: int) -> None:
         """Drops every line beyond ``step``, so that a run resumed there does not write them twice."""
         self._file.close()
         self._file = self._open(lambda row: row[STEP_KEY] <= step)
+        self._size = self._path.stat().st_size
 
     def log(self, step: int, numbers: Numbers) -> None:
-        """See ``Logger``."""
-        self._file.write(json.dumps({STEP_KEY: step, **numbers}, allow_nan=False) + "\n")
-        self._file.flush()
+        """See ``Logger``.
+
+        Raises:
+            OSError: where nothing can be written there; the line waits.
+        """
+        self._waiting.append(json.dumps({STEP_KEY: step, **numbers}, allow_nan=False).encode() + b"\n")
+        self.catch_up()
+
+    def catch_up(self) -> None:
+        """Writes the lines that wait.
+
+        Raises:
+            OSError: as before.
+        """
+        if not self._waiting:
+            return
+        self._require_there()
+        self._file.seek(self._size)
+        self._file.truncate()  # what is left of a line that did not fit
+        text = memoryview(b"".join(self._waiting))
+        while text:
+            text = text[self._file.write(text) :]
+        self._size = self._file.tell()
+        self._waiting.clear()
+
+    @property
+    def num_waiting(self) -> int:
+        """Lines that are not on disk."""
+        return len(self._waiting)
 
     def close(self) -> None:
         """See ``Logger``."""
         self._file.close()
 
-    def _open(self, is_kept: Callable[[dict[str, Any]], bool]) -> IO[str]:
-        _rewrite(self._path, is_kept)
-        file = self._path.open("a", encoding="utf-8")
-        _lock(file)
-        return file
+    def _require_there(self) -> None:
+        """Puts the file back where it was, with what was in it, if somebody removed it."""
+        if self._path.exists():
+            return
+        self._file.seek(0)
+        kept = self._file.read(self._size)
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        file = self._path.open("w+b", buffering=0)
+        file.write(kept)
+        self._file.close()
+        self._file = file
+
+    def _open(self, is_kept: Callable[[dict[str, Any]], bool]) -> FileIO:
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self.num_dropped += _rewrite(self._path, is_kept)
+        self._path.touch()
+        return self._path.open("r+b", buffering=0)
 
 
 class TensorBoard:
-    """Event files in ``tensorboard/``, made at the first number. What is not finite is left out."""
+    """Event files in ``tensorboard/``, made at the first number. What is not finite is left out.
+
+    Written here and now, without tensorboardX's queue: its thread dies where the disk is full, and the queue then
+    waits for it for ever.
+    """
 
     def __init__(self, run_dir: Path) -> None:
         self._folder = Path(run_dir) / TENSORBOARD_FOLDER
-        self._events: SummaryWriter | None = None
+        self._events: EventsWriter | None = None
         self._purge_step: int | None = None
 
     def resume_at(self, step: int) -> None:
@@ -81,13 +128,23 @@ class TensorBoard:
         self._purge_step = step + 1
 
     def log(self, step: int, numbers: Numbers) -> None:
-        """See ``Logger``."""
-        if self._events is None:
-            self._events = self._open()
-        for name, number in numbers.items():
-            if number is not None:
-                self._events.add_scalar(name, number, step)
-        self._events.flush()
+        """See ``Logger``.
+
+        Raises:
+            OSError: where nothing can be written there; these numbers are lost to TensorBoard.
+        """
+        from tensorboardX.proto.event_pb2 import Event
+        from tensorboardX.proto.summary_pb2 import Summary
+
+        values = [Summary.Value(tag=name, simple_value=value) for name, value in numbers.items() if value is not None]
+        try:
+            if self._events is None or not self._folder.exists():
+                self._events = self._open()
+            self._events.write_event(Event(wall_time=time.time(), step=step, summary=Summary(value=values)))
+            self._events.flush()
+        except OSError:
+            self._events = None  # what is half written ends this file; the next numbers go to a new one
+            raise
 
     def close(self) -> None:
         """See ``Logger``."""
@@ -95,12 +152,18 @@ class TensorBoard:
             self._events.close()
             self._events = None
 
-    def _open(self) -> "SummaryWriter":
+    def _open(self) -> "EventsWriter":
         """An event writer with a file of its own, even where two are made within one second."""
-        from tensorboardX import SummaryWriter
+        from tensorboardX.event_file_writer import EventsWriter
+        from tensorboardX.proto.event_pb2 import Event, SessionLog
 
-        number = len(list(self._folder.glob("events.*"))) if self._folder.exists() else 0
-        return SummaryWriter(str(self._folder), purge_step=self._purge_step, filename_suffix=f".{number}")
+        self._folder.mkdir(parents=True, exist_ok=True)
+        number = len(list(self._folder.glob("events.*")))
+        events = EventsWriter(str(self._folder / "events"), f".{number}")
+        if self._purge_step is not None:
+            began = SessionLog(status=SessionLog.START)
+            events.write_event(Event(wall_time=time.time(), step=self._purge_step, session_log=began))
+        return events
 
 
 def read_metrics(run_dir: Path) -> list[dict[str, Any]]:
@@ -108,51 +171,34 @@ def read_metrics(run_dir: Path) -> list[dict[str, Any]]:
 
     Raises:
         FileNotFoundError: where the run has none.
+        ValueError: where a whole line is no JSON.
     """
-    rows = []
-    with (Path(run_dir) / METRICS_FILE).open(encoding="utf-8") as file:
-        for line in file:
-            if line.endswith("\n"):
-                rows.append(json.loads(line))
-    return rows
+    with (Path(run_dir) / METRICS_FILE).open("rb") as file:
+        return [json.loads(line) for line in file if line.endswith(b"\n")]
 
 
-def is_being_written(run_dir: Path) -> bool:
-    """Whether a process on this machine holds the run's ``metrics.jsonl`` open to write."""
-    try:
-        import fcntl
-
-        with (Path(run_dir) / METRICS_FILE).open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except (ImportError, OSError):  # Windows, or a file system without locks
-        return False
-    return False
-
-
-def one_line(error: Exception) -> str:
+def one_line(error: BaseException) -> str:
     """What an error says, in one line."""
     return " ".join(str(error).split())[:300] or type(error).__name__
 
 
-def _lock(file: IO[str]) -> None:
-    """Holds a lock for as long as the file is open, where the system has such locks; the kernel ends it in a crash."""
-    with contextlib.suppress(ImportError, OSError):
-        import fcntl
+def _row(line: bytes) -> dict[str, Any] | None:
+    """The numbers of a whole line; None for any other."""
+    try:
+        row = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    is_whole = line.endswith(b"\n") and isinstance(row, dict) and isinstance(row.get(STEP_KEY), int | float)
+    return row if is_whole else None
 
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
-
-def _rewrite(path: Path, is_kept: Callable[[dict[str, Any]], bool]) -> None:
-    """Keeps the whole lines for which ``is_kept(row)`` holds, in one move."""
+def _rewrite(path: Path, is_kept: Callable[[dict[str, Any]], bool]) -> int:
+    """Keeps the whole lines for which ``is_kept(row)`` holds, in one move; how many others were damaged."""
     if not path.exists():
-        return
-    text = path.read_text(encoding="utf-8")
-    whole = [line for line in text.splitlines(keepends=True) if line.endswith("\n")]
-    kept = "".join(line for line in whole if is_kept(json.loads(line)))
-    if kept == text:
-        return
-    temporary = path.with_suffix(".partial")
-    temporary.write_text(kept, encoding="utf-8")
-    os.replace(temporary, path)
+        return 0
+    text = path.read_bytes()
+    rows = [(line, _row(line)) for line in text.splitlines(keepends=True)]
+    kept = b"".join(line for line, row in rows if row is not None and is_kept(row))
+    if kept != text:
+        replace_file(path, lambda file: file.write(kept))
+    return sum(row is None and line.endswith(b"\n") for line, row in rows)

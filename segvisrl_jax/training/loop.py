@@ -2,6 +2,8 @@
 
 import contextlib
 import dataclasses
+import functools
+import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -25,7 +27,7 @@ from segvisrl_jax.training.metrics import ProgressDisplay
 from segvisrl_jax.training.policy import Policy, network_policy
 from segvisrl_jax.training.processes import Processes, join
 from segvisrl_jax.training.rollout import ActorState, EpisodeLog, start_acting, unroll
-from segvisrl_jax.training.run import Run, open_run_dirs, open_runs
+from segvisrl_jax.training.run import HostState, Run, open_run_dirs, open_runs
 from segvisrl_jax.training.stop_signals import StopSignals
 from segvisrl_jax.training.trackers import require_installed
 
@@ -45,6 +47,7 @@ class TrainResult:
 
     run_dirs: tuple[Path, ...]  # one for each seed
     finished: bool  # False where a signal ended it early
+    not_on_disk: tuple[str, ...]  # what could not be written; empty unless a disk or folder failed
     decisions: int
     seconds: float
 
@@ -152,8 +155,16 @@ def validation_env(config: TrainConfig) -> EnvConfig:
     return env if rocks is None else replace_fields(env, num_rocks=rocks)
 
 
-def train(config: TrainConfig, say=print) -> TrainResult:
+class DivergedError(RuntimeError):
+    """Learning has no finite loss or gradient any more."""
+
+
+def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | None = None) -> TrainResult:
     """Runs one training, or one of every seed, to its end, or to the first SIGINT or SIGTERM, which saves and returns.
+
+    Where ``when_late`` is given and an update takes longer than ``stop_signals.GRACE_S`` after the signal, the state
+    before that update is saved in its place, and ``when_late`` is called, in another thread, with a line that says what
+    has been saved; so it is at a second signal, at once. It has to end the process.
 
     Writes config.json, metrics.jsonl, TensorBoard events, checkpoints/ and policy/ (the best one) to the run folder.
     Where it is one of several processes, it meets the others first, and ends with all of them; where one is lost,
@@ -162,6 +173,7 @@ def train(config: TrainConfig, say=print) -> TrainResult:
     Raises:
         ConfigError: where the run folder exists and is not to be resumed, or cannot be; where the policy to start from
             is of another architecture, or sees something else; where a logger is not installed or cannot be opened.
+        DivergedError: where no loss or gradient was finite for ``max_bad_updates`` updates.
     """
     processes = join(config)
     first_params = _params_to_start_from(config)
@@ -172,14 +184,18 @@ def train(config: TrainConfig, say=print) -> TrainResult:
         for run in runs:
             stack.callback(run.close)
         try:
-            finished = _Session(Trainer(config), runs, processes).drive(first_params)
+            session = _Session(config, runs, processes)
+            late = functools.partial(session.end_late, when_late) if when_late and processes.count == 1 else None
+            with StopSignals(late=late) as stop:
+                finished = session.drive(stop, first_params)
+            missing = tuple(f"{run.folder}: {what}" for run in runs for what in run.not_on_disk())
         except jax.errors.JaxRuntimeError as error:
             if processes.count > 1:  # at once: closing would wait for those who are gone
                 where = f"{runs[0].folder} has its last checkpoint"
                 processes.give_up(error, f"{where}: start all processes again with --resume")
             raise
     processes.leave()
-    return TrainResult(tuple(run.folder for run in runs), finished, runs[0].decisions, runs[0].host.seconds)
+    return TrainResult(tuple(run.folder for run in runs), finished, missing, runs[0].decisions, runs[0].host.seconds)
 
 
 def _say_nothing(line: str) -> None:
@@ -187,7 +203,9 @@ def _say_nothing(line: str) -> None:
 
 
 def _params_to_start_from(config: TrainConfig) -> Params | None:
-    if not config.start_from or config.resume:
+    folders = [Path(run.runs_dir) / run.run_name / "checkpoints" for run in config.runs]
+    has_begun = config.resume and all(any(folder.glob("[0-9]*")) for folder in folders)
+    if not config.start_from or has_begun:
         return None
     source, params, _ = load_policy(Path(config.start_from))
     for name, ours, theirs in (
@@ -199,45 +217,85 @@ def _params_to_start_from(config: TrainConfig) -> Params | None:
     return params
 
 
-@dataclasses.dataclass
 class _Session:
     """One sitting of the runs that a trainer trains."""
 
     trainer: Trainer
-    runs: Sequence[Run]
-    processes: Processes
 
-    def drive(self, first_params: Params | None) -> bool:
+    def __init__(self, config: TrainConfig, runs: Sequence[Run], processes: Processes) -> None:
+        self.config, self.runs, self.processes = config, runs, processes
+        self._saving = threading.Lock()
+        self._whole: tuple[TrainingState, list[HostState]] | None = None  # after the last update that is written down
+        self._bad_updates = 0  # in a row
+
+    def drive(self, stop: StopSignals, first_params: Params | None) -> bool:
         """Updates until the end or a signal, and saves; whether it is the end."""
-        config = self.trainer.config
+        config = self.config
+        self.trainer = Trainer(config)
         state = self._start(first_params)
         for run in self.runs:
             run.begin()
         every = -(-config.evaluation.every_decisions // config.ppo.decisions_per_update)
         total = config.num_updates * config.ppo.decisions_per_update
         console = None if self.processes.is_first else Console(quiet=True)
-        with StopSignals() as stop, ProgressDisplay(total, self._decisions, self._name, console) as display:
+        with ProgressDisplay(total, self._decisions, self._name, console) as display:
             while self._updates < config.num_updates and not self.processes.any(stop.requested):
+                self._whole = state, [run.snapshot() for run in self.runs]
                 state, rows = self._update(state)
+                self._require_finite(rows)
                 if self._updates % every == 0 or self._updates == config.num_updates:
                     self._evaluate(state, rows)
                 for run, row in zip(self.runs, rows, strict=True):
                     run.write(row)
                 display.update(self._decisions, _median(rows))
-                if self._updates % config.checkpoint_every_updates == 0:
+                if self._updates % config.checkpoint_every_updates == 0 and not self._bad_updates:
                     self._save(state)
             self._save(state)
         return self._updates >= config.num_updates
 
     def _start(self, first_params: Params | None) -> TrainingState:
-        state = self.trainer.start(first_params)
-        if not self.trainer.config.resume:
+        begun = [run.num_saved is not None for run in self.runs]
+        going_on = self.config.resume and all(begun)
+        state = self.trainer.start(None if going_on else first_params)
+        if not self.config.resume:
             return state
+        if not any(begun):
+            self.runs[0].say("nothing was saved yet: starting at the beginning")
+            return state
+        require(all(begun), "num_seeds", len(self.runs), "1, for each run by itself: not all of them have a checkpoint")
         restored = [run.restore(self.trainer.of_seed(state, i)) for i, run in enumerate(self.runs)]
         reached = [run.host.updates for run in self.runs]
         same = len(set(reached)) == 1
         require(same, "num_seeds", len(self.runs), f"1, for each run by itself: they have made {reached} updates")
         return self.trainer.of_seeds(restored)
+
+    def end_late(self, end: Callable[[str], object], at_once: bool) -> None:
+        """In the watching thread: saves the state before the update that takes too long, and ends the process."""
+        with self._saving:
+            if self._whole is not None and not at_once and not self._bad_updates:
+                state, hosts = self._whole
+                for i, (run, host) in enumerate(zip(self.runs, hosts, strict=True)):
+                    run.save(self.trainer.of_seed(state, i), host)
+            saved = self.runs[0].num_saved
+            decisions = (saved or 0) * self.config.ppo.decisions_per_update
+            end(f"Stopped at once; saved are {decisions:,} decisions." if saved else "Stopped before the first save.")
+
+    def _require_finite(self, rows: Sequence[dict[str, float]]) -> None:
+        """Stops a run that learns nothing any more, with the last good checkpoint.
+
+        Raises:
+            DivergedError: after ``max_bad_updates`` updates in a row in which a gradient step was skipped.
+        """
+        is_bad = any(row["ppo/skipped_steps"] > 0 for row in rows)
+        self._bad_updates = self._bad_updates + 1 if is_bad else 0
+        if self._bad_updates < self.config.max_bad_updates:
+            return
+        saved = self.runs[0].num_saved
+        kept = f"the checkpoint of update {saved} is from before" if saved else "nothing was saved before"
+        raise DivergedError(
+            f"loss or gradient was not finite in {self._bad_updates} updates in a row; {kept}; "
+            "lower ppo.learning_rate or ppo.max_gradient_norm"
+        )
 
     def _update(self, state: TrainingState) -> tuple[TrainingState, list[dict[str, float]]]:
         began = time.monotonic()
@@ -254,8 +312,9 @@ class _Session:
             rows[i] |= run.judge(self.trainer.evaluate(params, run.config.seed), params)
 
     def _save(self, state: TrainingState) -> None:
-        for i, run in enumerate(self.runs):
-            run.save(self.trainer.of_seed(state, i))
+        with self._saving:
+            for i, run in enumerate(self.runs):
+                run.save(self.trainer.of_seed(state, i))
 
     @property
     def _updates(self) -> int:

@@ -6,6 +6,7 @@ number of decisions so far. This file neither computes them nor draws figures; `
 
 import collections
 import datetime
+import functools
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -61,8 +62,11 @@ class MetricsWriter:
     Args:
         run_dir: the run's folder; made if it is missing.
         tensorboard: whether to write ``tensorboard/`` too.
-        trackers: more loggers, by name. One that fails is named once and dropped; the run's own files must not fail.
+        trackers: more loggers, by name. One that fails is named once and dropped.
         say: where that is said.
+
+    Where the run's own files cannot be written (the disk is full, the folder is gone), that is said once, and every
+    later ``write`` tries again: ``metrics.jsonl`` then gets all the lines that it missed.
 
     An existing file is continued; call ``resume_at`` first where the run goes on from a checkpoint.
     """
@@ -74,35 +78,56 @@ class MetricsWriter:
         trackers: Mapping[str, Logger] | None = None,
         say: Callable[[str], None] = print,
     ) -> None:
-        self._own: list[JsonLines | TensorBoard] = [JsonLines(run_dir)]
+        self._lines = JsonLines(run_dir)
+        self._own: dict[str, JsonLines | TensorBoard] = {METRICS_FILE: self._lines}
         if tensorboard:
-            self._own.append(TensorBoard(run_dir))
+            self._own[TENSORBOARD_FOLDER] = TensorBoard(run_dir)
+        self._failing: set[str] = set()
         self._trackers, self._say = dict(trackers or {}), say
+        if self._lines.num_dropped:
+            say(f"warning: {METRICS_FILE}: {self._lines.num_dropped} damaged lines are left out")
 
     def resume_at(self, step: int) -> None:
         """Drops every line beyond ``step``, so that a run resumed there does not write them twice."""
-        for logger in self._own:
+        for logger in self._own.values():
             logger.resume_at(step)
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
         """Writes one line. Values are numbers or arrays of one number (NumPy, JAX); what is not finite becomes null."""
         numbers = {name: _number(value) for name, value in values.items()}
-        for logger in self._own:
-            logger.log(int(step), numbers)
+        for name, logger in self._own.items():
+            self._try(name, functools.partial(logger.log, int(step), numbers))
         self._for_trackers(lambda tracker: tracker.log(int(step), numbers))
 
     def close(self) -> None:
         """Closes the files; a second call does nothing."""
-        for logger in self._own:
-            logger.close()
+        for name, logger in self._own.items():
+            self._try(name, logger.close)
         self._for_trackers(lambda tracker: tracker.close())
         self._trackers = {}
+
+    def catch_up(self) -> int:
+        """Tries once more what could not be written; the number of lines that are still not on disk."""
+        self._try(METRICS_FILE, self._lines.catch_up)
+        return self._lines.num_waiting
 
     def __enter__(self) -> "MetricsWriter":
         return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+    def _try(self, name: str, do: Callable[[], None]) -> None:
+        try:
+            do()
+        except OSError as error:
+            if name not in self._failing:
+                self._say(f"warning: {name} cannot be written ({one_line(error)}); the run goes on, and tries again")
+            self._failing.add(name)
+            return
+        if name in self._failing:
+            self._failing.remove(name)
+            self._say(f"{name} is written again")
 
     def _for_trackers(self, do: Callable[[Logger], None]) -> None:
         for name, tracker in list(self._trackers.items()):

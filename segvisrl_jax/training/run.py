@@ -3,6 +3,7 @@
 import collections
 import contextlib
 import dataclasses
+import functools
 import json
 import shutil
 from collections.abc import Callable
@@ -13,20 +14,24 @@ import jax
 import numpy as np
 
 from segvisrl_jax.agent.networks import Params
-from segvisrl_jax.config import ConfigError, TrainConfig, flatten, to_dict
+from segvisrl_jax.config import ConfigError, TrainConfig, flatten, read_json, to_dict
 from segvisrl_jax.training.checkpoint import Checkpoints, save_policy
+from segvisrl_jax.training.loggers import one_line
+from segvisrl_jax.training.manifest import replace_file
 from segvisrl_jax.training.metrics import MetricsWriter
 from segvisrl_jax.training.processes import Processes
 from segvisrl_jax.training.rollout import EpisodeLog
+from segvisrl_jax.training.run_lock import RunLock, is_being_trained
 from segvisrl_jax.training.trackers import open_trackers
 from segvisrl_jax.types import Outcome
 
 RECENT_EPISODES = 200  # what the progress bar's shares are taken over
 FREE_ON_RESUME = (
     "steps", "resume", "runs_dir", "run", "evaluation", "checkpoint_every_updates", "preset", "loggers",
-    "num_devices", "num_seeds", "coordinator", "num_processes", "process_id",
+    "max_bad_updates", "num_devices", "num_seeds", "coordinator", "num_processes", "process_id",
 )  # fmt: skip
-OUTCOMES = (Outcome.SUCCESS, Outcome.COLLISION, Outcome.FALL, Outcome.TIMEOUT)
+OUTCOMES = (Outcome.SUCCESS, Outcome.COLLISION, Outcome.FALL, Outcome.TIMEOUT, Outcome.UNSTABLE)
+OURS = ("lock",)  # what may be in a folder that no run has begun in, besides half-written files
 
 
 @dataclasses.dataclass
@@ -37,28 +42,37 @@ class HostState:
     seconds: float = 0.0  # spent training, over all sessions of the run
     recent: list[list[float]] = dataclasses.field(default_factory=list)  # outcome, return, decisions
     best: list[float] = dataclasses.field(default_factory=list)  # rank of the best policy so far
+    unstable: int = 0  # episodes that the physics ended
 
 
 class Run:
-    """The bookkeeping of a run whose folder is open. Of several processes, the first one alone writes numbers."""
+    """The bookkeeping of a run whose folder is open. Of several processes, the first one alone writes numbers.
+
+    What cannot be written is said once, and tried again: a full disk or a folder that is gone ends no run.
+    """
 
     def __init__(self, config: TrainConfig, processes: Processes, say: Callable[[str], None]):
         """Opens what is written to.
 
         Raises:
-            ConfigError: where a logger cannot be opened.
+            ConfigError: where another process has the folder, a logger cannot be opened, or no checkpoint is whole.
         """
         self.config, self.say = config, say
         self.folder = Path(config.runs_dir) / config.run_name
         self.host = HostState()
+        self.num_saved: int | None = None  # updates behind the newest checkpoint
         self._recent: collections.deque[list[float]] = collections.deque(maxlen=RECENT_EPISODES)
-        self._is_first = processes.is_first
+        self._is_first, self._is_alone = processes.is_first, processes.count == 1
+        self._policy_waiting: Callable[[], None] | None = None
+        self._failing: set[str] = set()
         with contextlib.ExitStack() as stack:
             self._writer = None
             if self._is_first:
+                stack.enter_context(contextlib.closing(RunLock(self.folder)))
                 trackers = open_trackers(config, self.folder)
                 self._writer = stack.enter_context(MetricsWriter(self.folder, trackers=trackers, say=say))
-            self._checkpoints = Checkpoints(self.folder)
+            self._checkpoints = Checkpoints(self.folder, processes, say)
+            self.num_saved = self._checkpoints.latest
             stack.callback(self._checkpoints.close)
             self._open = stack.pop_all()
 
@@ -70,6 +84,7 @@ class Run:
         """
         state, data = self._checkpoints.restore_latest(like)
         self.host = HostState(**data)
+        self._recent.clear()
         self._recent.extend(self.host.recent)
         self.say(f"going on from update {self.host.updates} of {self.config.num_updates}")
         return state
@@ -81,13 +96,15 @@ class Run:
 
     def count(self, metrics: dict[str, Any], log: EpisodeLog, seconds: float) -> dict[str, float]:
         """Counts one update, and gives its row of numbers."""
-        self._recent.extend(_finished_episodes(log))
+        ended = _finished_episodes(log)
+        self._recent.extend(ended)
+        self.host.unstable += sum(outcome == Outcome.UNSTABLE for outcome, _, _ in ended)
         self.host.recent = [list(episode) for episode in self._recent]
         self.host.updates += 1
         self.host.seconds += seconds
         speed = self.config.ppo.decisions_per_update / seconds
         times = {"time/seconds": self.host.seconds, "time/decisions_per_second": speed}
-        return _row(metrics, log, self._recent) | times
+        return _row(metrics, log, self._recent) | times | {"episode/num_unstable": float(self.host.unstable)}
 
     def judge(self, summary: dict[str, Any], params: Params) -> dict[str, float]:
         """Keeps a policy that is as good as the best so far, and gives the row of its evaluation."""
@@ -96,20 +113,64 @@ class Run:
             self.host.best = rank
             scores = {**summary, "scenes": "validation", "decisions": self.decisions}
             if self._is_first:
-                save_policy(self.folder / "policy", self.config, params, scores)
+                folder = self.folder / "policy"
+                self._policy_waiting = functools.partial(save_policy, folder, self.config, params, scores)
+                self._write_policy()
         low, high = summary["success_ci95"]
         kept = {k: v for k, v in summary.items() if isinstance(v, float)}
         kept |= {"success_low": low, "success_high": high}
         return {f"evaluation/{name}": value for name, value in kept.items()}
+
+    def snapshot(self) -> HostState:
+        """What the host knows now, to be saved later."""
+        return dataclasses.replace(self.host, recent=list(self.host.recent), best=list(self.host.best))
 
     def write(self, row: dict[str, float]) -> None:
         """Writes a row to every logger."""
         if self._writer:
             self._writer.write(self.decisions, row)
 
-    def save(self, state: Any) -> None:
-        """Writes a checkpoint."""
-        self._checkpoints.save(self.host.updates, state, dataclasses.asdict(self.host))
+    def save(self, state: Any, host: HostState | None = None) -> None:
+        """Writes a checkpoint: of now, or of when the host's state was ``host``."""
+        self._put_settings_back()
+        host = host or self.host
+        write = functools.partial(self._checkpoints.save, host.updates, state, dataclasses.asdict(host))
+        if not self._is_alone:
+            write()  # the others wait for this process: what fails here fails everywhere
+            self.num_saved = host.updates
+        elif self._try(f"the checkpoint of update {host.updates}", write):
+            self.num_saved = host.updates
+        self._write_policy()
+
+    def not_on_disk(self) -> list[str]:
+        """What could not be written in spite of all tries, after one more."""
+        missing = [] if self.num_saved == self.host.updates else [f"the checkpoint of update {self.host.updates}"]
+        self._write_policy()
+        missing += ["the best policy"] if self._policy_waiting else []
+        lines = self._writer.catch_up() if self._writer else 0
+        return missing + ([f"{lines} lines of metrics.jsonl"] if lines else [])
+
+    def _write_policy(self) -> None:
+        if self._policy_waiting and self._try("the best policy", self._policy_waiting):
+            self._policy_waiting = None
+
+    def _put_settings_back(self) -> None:
+        """Writes config.json again where somebody removed the run's folder."""
+        if self._is_first and not (self.folder / "config.json").exists():
+            self._try("config.json", functools.partial(_write_settings, self.folder, self.config))
+
+    def _try(self, what: str, write: Callable[[], None]) -> bool:
+        try:
+            write()
+        except Exception as error:  # orbax and the file system raise many kinds
+            kind = what.split(" of ")[0]
+            if kind not in self._failing:
+                kept = f"; the last good checkpoint is that of update {self.num_saved}" if self.num_saved else ""
+                self.say(f"warning: {what} cannot be written ({one_line(error)}); the run goes on{kept}")
+            self._failing.add(kind)
+            return False
+        self._failing.discard(what.split(" of ")[0])
+        return True
 
     def close(self) -> None:
         """Ends what is written to."""
@@ -140,20 +201,32 @@ def open_runs(config: TrainConfig, processes: Processes, say: Callable[[str], No
     """The run of every seed; where a logger fails, new runs leave no folders behind that would be in the way.
 
     Raises:
-        ConfigError: where a logger cannot be opened.
+        ConfigError: where a folder is in use or cannot be written, or a logger cannot be opened.
     """
     opened: list[Run] = []
     try:
         for settings in config.runs:
-            opened.append(Run(settings, processes, say))
+            opened.append(_open_run(settings, processes, say))
     except ConfigError:
         for run in opened:
             run.close()
-        if not config.resume:
-            for settings in config.runs:
-                shutil.rmtree(Path(settings.runs_dir) / settings.run_name)
+        for settings in config.runs:
+            folder = Path(settings.runs_dir) / settings.run_name
+            if not config.resume and not is_being_trained(folder):
+                shutil.rmtree(folder)
         raise
     return opened
+
+
+def _open_run(config: TrainConfig, processes: Processes, say: Callable[[str], None]) -> Run:
+    try:
+        return Run(config, processes, say)
+    except OSError as error:
+        raise _cannot_be_written(Path(config.runs_dir) / config.run_name, error) from None
+
+
+def _cannot_be_written(run_dir: Path, error: OSError) -> ConfigError:
+    return ConfigError(f"run = {str(run_dir)!r}: cannot be written ({error.strerror or error})")
 
 
 def open_run_dir(config: TrainConfig) -> Path:
@@ -165,21 +238,46 @@ def open_run_dir(config: TrainConfig) -> Path:
     run_dir = Path(config.runs_dir) / config.run_name
     config_file = run_dir / "config.json"
     if not config.resume:
-        if run_dir.exists() and any(run_dir.iterdir()):
-            raise ConfigError(f"run = {str(run_dir)!r}: exists already; go on with --resume, or choose another --run")
-        run_dir.mkdir(parents=True, exist_ok=True)
-        config_file.write_text(json.dumps(to_dict(config), indent=2) + "\n")
+        taken = ConfigError(f"run = {str(run_dir)!r}: exists already; go on with --resume, or choose another --run")
+        if _holds_something(run_dir):
+            raise taken
+        try:
+            run_dir.mkdir(parents=True, exist_ok=run_dir.exists())
+            _write_settings(run_dir, config)
+        except FileExistsError:  # another process was faster
+            raise taken from None
+        except OSError as error:
+            raise _cannot_be_written(run_dir, error) from None
         return run_dir
-    if not (run_dir / "checkpoints").is_dir() or not config_file.is_file():
+    if not config_file.is_file():
         raise ConfigError(f"run = {str(run_dir)!r}: has no checkpoint to resume; leave --resume out")
-    _require_same_run(config, json.loads(config_file.read_text()), run_dir)
+    try:
+        before = read_json(config_file)
+        then = flatten(to_dict(TrainConfig())) | flatten(before)
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise ConfigError(f"{config_file}: cannot be read ({one_line(error)})") from None
+    _require_same_run(config, then, run_dir)
     return run_dir
 
 
-def _require_same_run(config: TrainConfig, before: dict[str, Any], run_dir: Path) -> None:
+def _holds_something(run_dir: Path) -> bool:
+    """Whether there is more in a folder than what a run leaves that ended before it wrote its settings."""
+    if not run_dir.exists():
+        return False
+    if not run_dir.is_dir():
+        return True
+    return any(path.name not in OURS and path.suffix != ".partial" for path in run_dir.iterdir())
+
+
+def _write_settings(run_dir: Path, config: TrainConfig) -> None:
+    run_dir.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(to_dict(config), indent=2) + "\n"
+    replace_file(run_dir / "config.json", lambda file: file.write(text.encode()))
+
+
+def _require_same_run(config: TrainConfig, then: dict[str, Any], run_dir: Path) -> None:
     """Only the number of steps and bookkeeping may change when a run goes on. What old runs do not say is neutral."""
     now = flatten(json.loads(json.dumps(to_dict(config))))
-    then = flatten(to_dict(TrainConfig())) | flatten(before)
     for name, value in now.items():
         if name.split(".")[0] not in FREE_ON_RESUME and value != then.get(name):
             raise ConfigError(f"{name} = {value!r}: should be {then.get(name)!r}, as when {run_dir} was started")

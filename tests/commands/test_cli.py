@@ -52,6 +52,11 @@ def segvisrl(*words, cwd):
         (["bench", "fly"], ["fly", "physics"]),
         (["bench", "render", "--batches", "0"], ["--batches", "0"]),
         (["bench", "render", "--json", "no/such/folder/x.json"], ["--json", "folder that exists"]),
+        (["bench", "render", "--plot", "x.png"], ["--plot", "x.png", "growth"]),
+        (["bench", "growth", "--plot", "x.pdf"], ["--plot", "x.pdf", ".png"]),
+        (["bench", "growth", "--growth.most-gib", "0"], ["most-gib", "0", "above 0"]),
+        (["bench", "growth", "--growth.scales", "900"], ["scale", "900", "at least 4 pixels"]),
+        (["bench", "growth", "--arch", "mlp"], ["--arch", "mlp", "images"]),
         (["sweep", "--vary", "scale=900"], ["scale", "900", "at least 4 pixels"]),
     ],
 )
@@ -177,6 +182,27 @@ def test_bench_prints_a_table_and_writes_the_same_numbers(tmp_path):
     assert done.stdout.count("| scanline | 1920 x 1080 to 16 x 9 | 4 |") == 2
     assert result["command"].startswith("segvisrl bench physics render")
     assert result["machine"]["cores"] == os.cpu_count()
+
+
+@pytest.mark.slow
+def test_bench_says_how_costs_grow(tmp_path):
+    sizes = ["--growth.rocks", "1", "--growth.envs", "2", "--growth.scales", "2", "--growth.unrolls", "32"]
+    words = [*sizes, "--preset", "smoke", "--growth.most-gib", "2", "--repeats", "1", "--json", "g.json"]
+    done = segvisrl("bench", "growth", *words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "g.png").stat().st_size > 10_000
+    rows = json.loads((tmp_path / "g.json").read_text())["rows"]
+    points = {(row["varied"], row["value"]): row for row in rows if row["part"] == "growth"}
+    assert points.pop(("pixels", 960 * 540))["note"].startswith("not run: 5.")
+    assert list(points) == [
+        ("rocks", 1), ("environments", 2), ("environments", 4), ("pixels", 16 * 9), ("unroll", 32)
+    ]  # fmt: skip
+    for row in points.values():
+        assert all(row[name] > 0 for name in ("physics_ms", "rendering_ms", "acting_ms", "learning_ms"))
+        assert 0.1 < row["memory_gib"] < 4
+    [exponents] = [row for row in rows if row["part"] == "growth exponents"]
+    assert (exponents["varied"], exponents["over"]) == ("environments", "2 to 4")
+    assert "not run: 5." in done.stdout
 
 
 @pytest.mark.slow

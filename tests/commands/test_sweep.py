@@ -145,4 +145,4 @@ def test_one_run_on_two_nodes(tmp_path, cluster):
     assert done.stdout.count("test scenes:") == 1
     config = json.loads((tmp_path / "both" / "config.json").read_text())
     assert config["num_processes"] == 2
-    assert (tmp_path / "both" / "policy" / "params.npz").exists()
+    assert (tmp_path / "both" / "policy" / "policy.json").exists()

@@ -103,6 +103,28 @@ def test_a_containers_limit_of_memory_counts(tmp_path):
     assert resources._memory(None).mark == "note"
 
 
+def test_files_that_a_container_keeps_in_memory_count_as_free(tmp_path):
+    meminfo = tmp_path / "meminfo"
+    meminfo.write_text(f"MemTotal: {16 * 2**20} kB\nMemAvailable: {8 * 2**20} kB\n")
+    new = cgroup(tmp_path / "new", memory_max=str(5 * GIB), memory_current=str(4 * GIB))
+    (new / "memory.stat").write_text(f"anon 1\ninactive_file {GIB}\n")
+    old = tmp_path / "old" / "memory"
+    old.mkdir(parents=True)
+    (old / "memory.limit_in_bytes").write_text(str(6 * GIB))
+    (old / "memory.usage_in_bytes").write_text(str(5 * GIB))
+    (old / "memory.stat").write_text(f"inactive_file 1\ntotal_inactive_file {2 * GIB}\n")
+    assert resources.free_memory_bytes(new, meminfo) == 2 * GIB
+    assert resources.free_memory_bytes(old.parent, meminfo) == 3 * GIB
+    assert resources.all_memory_bytes(old.parent, meminfo) == 6 * GIB
+    (old / "memory.limit_in_bytes").write_text(str(2**63 - 4096))
+    assert resources.free_memory_bytes(old.parent, meminfo) == 8 * GIB
+    assert resources.all_memory_bytes(old.parent, meminfo) == 16 * GIB
+
+
+def test_the_peak_is_that_of_this_process():
+    assert 2**24 < resources.peak_resident_bytes() < 2**36
+
+
 def test_a_folder_that_cannot_be_written_to_stops_training(tmp_path):
     assert resources._disk(tmp_path / "new" / "runs").mark == "ok"
     (tmp_path / "file").touch()

@@ -1,5 +1,6 @@
 """What a folder of runs holds is listed; what is damaged or foreign is named, and nothing stops the list."""
 
+import contextlib
 import json
 import os
 import time
@@ -8,7 +9,7 @@ import pytest
 
 from segvisrl_jax.config import preset_config, replace_fields, to_dict
 from segvisrl_jax.report.run_list import Complaint, list_runs
-from segvisrl_jax.training.metrics import MetricsWriter
+from segvisrl_jax.training.run_lock import RunLock
 
 OLD_S = 7200.0
 
@@ -54,7 +55,7 @@ def state_of(folder):
 def test_a_run_that_a_process_writes_is_running_and_then_is_not(tmp_path):
     run = make_run(tmp_path, "a", [{}])
     assert state_of(tmp_path) == "stopped"
-    with MetricsWriter(run, tensorboard=False):
+    with contextlib.closing(RunLock(run)):
         assert state_of(tmp_path) == "running"
     assert state_of(tmp_path) == "stopped"
 

@@ -90,18 +90,31 @@ def test_policies_come_back_bit_by_bit(tmp_path):
     jax.tree.map(np.testing.assert_array_equal, found, params)
 
 
-@pytest.mark.parametrize("name", ["policy.json", "params.npz"])
-@pytest.mark.parametrize("damage", ["empty", "truncated", "missing", "garbage"])
-def test_a_damaged_policy_is_named(name, damage, tmp_path):
-    params = {"params": {"w": np.arange(1000, dtype=np.float32)}}
-    save_policy(tmp_path, preset_config("mlp", "cpu"), params, {})
-    file = tmp_path / name
-    whole = file.read_bytes()
-    if damage == "missing":
-        file.unlink()
-    else:
-        file.write_bytes({"empty": b"", "truncated": whole[: len(whole) // 2], "garbage": b"\x80\x04x."}[damage])
-    with pytest.raises(ConfigError, match=name if name == "params.npz" or damage != "missing" else "policy"):
+def test_a_newer_policy_takes_the_place_of_an_older_one(tmp_path):
+    for value in (1.0, 2.0):
+        save_policy(tmp_path, preset_config("mlp", "cpu"), {"params": {"w": np.full(3, value, np.float32)}}, {})
+    _, found, _ = load_policy(tmp_path)
+    np.testing.assert_array_equal(found["params"]["w"], 2.0)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_policy_of_the_first_format_is_read(tmp_path):
+    """It has no checksums, and its parameters are in params.npz."""
+    config = preset_config("mlp", "cpu")
+    save_policy(tmp_path, config, {"params": {"w": np.ones(3, np.float32)}}, {"success": 1.0})
+    card = json.loads((tmp_path / "policy.json").read_text())
+    (tmp_path / card["params"]["file"]).rename(tmp_path / "params.npz")
+    (tmp_path / "policy.json").write_text(json.dumps({"format": 1, "config": card["config"], "scores": card["scores"]}))
+    stored, found, scores = load_policy(tmp_path)
+    assert (stored, scores) == (config, {"success": 1.0})
+    np.testing.assert_array_equal(found["params"]["w"], 1.0)
+
+
+def test_a_policy_of_a_newer_format_is_refused(tmp_path):
+    save_policy(tmp_path, preset_config("mlp", "cpu"), {"params": {}}, {})
+    card = json.loads((tmp_path / "policy.json").read_text())
+    (tmp_path / "policy.json").write_text(json.dumps(card | {"format": 99}))
+    with pytest.raises(ConfigError, match=r"policy.json: was written by a newer version .*format 99"):
         load_policy(tmp_path)
 
 

@@ -9,7 +9,7 @@ import pytest
 from segvisrl_jax.config import ConfigError, TrainConfig, from_dict, preset_config, replace_fields
 from segvisrl_jax.report.recipe import recipe
 from segvisrl_jax.training import loop, run
-from segvisrl_jax.training.loggers import is_being_written, read_metrics
+from segvisrl_jax.training.loggers import read_metrics
 from segvisrl_jax.training.metrics import MetricsWriter
 from segvisrl_jax.training.trackers import IDS_FILE, open_trackers, require_installed
 
@@ -102,15 +102,6 @@ def test_a_run_may_go_on_with_other_loggers_and_from_before_there_were_any(tmp_p
         run.open_run_dir(replace_fields(config, resume=True, loggers=("mlflow",)))
         assert from_dict(TrainConfig, before).loggers == tuple(before.get("loggers", ()))
     assert recipe(config) == recipe(replace_fields(config, loggers=("mlflow",)))
-
-
-def test_a_run_that_is_being_written_shows(tmp_path):
-    assert not is_being_written(tmp_path)
-    with MetricsWriter(tmp_path, tensorboard=False) as writer:
-        assert is_being_written(tmp_path)
-        writer.resume_at(0)
-        assert is_being_written(tmp_path)
-    assert not is_being_written(tmp_path)
 
 
 def two_sittings(config, run_dir):

@@ -1,0 +1,34 @@
+"""Whether something can be written where a user asks for it, said before hours of work rather than after them."""
+
+import os
+from pathlib import Path
+
+from segvisrl_jax.config.checks import is_plain_text, require
+
+LONGEST_PART_BYTES = 255  # of a path, on the file systems in use
+A_PATH = f"a path without control characters, whose parts have at most {LONGEST_PART_BYTES} bytes"
+
+
+def is_path(text: str) -> bool:
+    """Whether it can be printed, and no part of it is longer than a file's name can be."""
+    return is_plain_text(text) and all(len(part.encode()) <= LONGEST_PART_BYTES for part in Path(text).parts)
+
+
+def require_file_can_be_written(path: Path, name: str, should: str = "in a folder that exists") -> None:
+    """Raises ``ConfigError`` unless a file can be written there: in a folder that exists, and is no folder itself."""
+    shown = str(path)
+    require(is_path(shown), name, shown, A_PATH)
+    folder = path.resolve().parent
+    require(folder.is_dir(), name, shown, should)
+    require(not path.is_dir(), name, shown, "a file; this is a folder")
+    place = path if path.exists() else folder
+    require(os.access(place, os.W_OK), name, shown, "where this user may write")
+
+
+def require_folder_can_be_made(path: Path, name: str) -> None:
+    """Raises ``ConfigError`` unless it is a folder that can be written to, or can be made where there is nothing."""
+    shown = str(path)
+    require(is_path(shown), name, shown, A_PATH)
+    existing = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
+    require(existing.is_dir(), name, shown, f"a folder; {existing} is a file")
+    require(os.access(existing, os.W_OK | os.X_OK), name, shown, f"where this user may write; {existing} is not")

@@ -1,0 +1,54 @@
+"""One process at a time writes to a run's folder. The kernel ends the lock with its process, however that ends."""
+
+import contextlib
+from pathlib import Path
+from typing import IO
+
+from segvisrl_jax.config import ConfigError
+
+LOCK_FILE = "lock"
+
+
+class RunLock:
+    """Holds a run's folder until it is closed; nothing where the file system has no locks (Windows, some networks).
+
+    Raises:
+        ConfigError: where another process holds it.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        self._file: IO[bytes] = (Path(run_dir) / LOCK_FILE).open("wb")
+        try:
+            _lock(self._file, exclusive=True)
+        except BlockingIOError:
+            self._file.close()
+            raise ConfigError(f"run = {str(run_dir)!r}: another process is training it") from None
+
+    def close(self) -> None:
+        """Lets go of the folder; a second call does nothing."""
+        self._file.close()
+
+
+def is_being_trained(run_dir: Path) -> bool:
+    """Whether a process on this machine holds the run's folder."""
+    try:
+        with (Path(run_dir) / LOCK_FILE).open("rb") as file:
+            _lock(file, exclusive=False)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def _lock(file: IO[bytes], exclusive: bool) -> None:
+    """Locks, or raises BlockingIOError."""
+    with contextlib.suppress(ImportError):
+        import fcntl
+
+        try:
+            fcntl.flock(file, (fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise
+        except OSError:
+            return

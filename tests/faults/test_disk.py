@@ -1,0 +1,171 @@
+"""A full disk, folders that cannot be written or vanish: said aloud, and the last checkpoint stays good."""
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from segvisrl_jax import cli
+from segvisrl_jax.config import ConfigError, preset_config, replace_fields
+from segvisrl_jax.training import loop
+from segvisrl_jax.training.checkpoint import Checkpoints, load_policy
+from segvisrl_jax.training.metrics import read_metrics
+
+DISK_MB = 8  # room for the first checkpoints of this small run, and little more
+SMALL = {"num_envs": 4, "unroll_length": 8, "num_minibatches": 2, "max_decisions": 10, "mlp_sizes": (8, 8)}
+NUM_UPDATES = 8
+
+
+def settings(runs_dir, **more):
+    named = {"steps": NUM_UPDATES * 32, "checkpoint_every_updates": 2, "every_decisions": 64, "episodes": 2}
+    return replace_fields(
+        preset_config("mlp", "smoke"),
+        **(SMALL | named | {"num_slots": 2, "runs_dir": str(runs_dir), "run": "run", "engine": "native"} | more),
+    )
+
+
+@pytest.fixture
+def disk(tmp_path):
+    """A small disk of its own."""
+    mount = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={DISK_MB}m", "tmpfs", str(tmp_path)], capture_output=True, check=False
+    )
+    if mount.returncode:
+        pytest.skip("mounting a disk is not permitted here")
+    yield tmp_path
+    subprocess.run(["umount", "--lazy", str(tmp_path)], check=True)
+
+
+@pytest.fixture
+def during(monkeypatch):
+    """Has something happen before an update, by its number."""
+    happens = {}
+    update = loop._Session._update
+
+    def update_and(session, state):
+        happens.get(session._updates + 1, lambda: None)()
+        return update(session, state)
+
+    monkeypatch.setattr(loop._Session, "_update", update_and)
+    return happens
+
+
+def fill(disk):
+    """Leaves no byte free."""
+    left = shutil.disk_usage(disk).free
+    (disk / "filler").write_bytes(b"0" * left)
+    assert shutil.disk_usage(disk).free == 0
+
+
+def arrays(config):
+    """Of the newest checkpoint, read with everything checked."""
+    said = []
+    checkpoints = Checkpoints(Path(config.runs_dir) / config.run_name, say=said.append)
+    state, host = checkpoints.restore_latest(loop.Trainer(config).start())
+    checkpoints.close()
+    assert not said, said
+    flat = [leaf for leaf in jax.tree.leaves(state) if not jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)]
+    return host["updates"], [np.asarray(leaf) for leaf in flat]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """The run that nothing happens to."""
+    config = settings(tmp_path_factory.mktemp("undisturbed"))
+    loop.train(config, say=lambda line: None)
+    return config
+
+
+def require_same_run(config, undisturbed):
+    (ours, found), (theirs, expected) = arrays(config), arrays(undisturbed)
+    assert ours == theirs
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+    steps = [row["step"] for row in read_metrics(Path(config.runs_dir) / "run")]
+    assert steps == [32 * (i + 1) for i in range(NUM_UPDATES)]
+    load_policy(Path(config.runs_dir) / "run" / "policy")
+
+
+@pytest.mark.slow
+def test_a_disk_that_was_full_for_a_while_costs_nothing(disk, during, undisturbed):
+    during |= {4: lambda: fill(disk), 7: (disk / "filler").unlink}
+    said = []
+    result = loop.train(settings(disk), say=said.append)
+    assert (result.finished, result.not_on_disk) == (True, ())
+    assert any("checkpoint of update 4 cannot be written" in line and "update 2" in line for line in said), said
+    assert any("metrics.jsonl cannot be written" in line for line in said), said
+    assert any("metrics.jsonl is written again" in line for line in said), said
+    assert len(said) < 10, said
+    require_same_run(settings(disk), undisturbed)
+
+
+@pytest.mark.slow
+def test_a_disk_that_stays_full_keeps_the_last_checkpoint(disk, during, undisturbed):
+    during[5] = lambda: fill(disk)
+    result = loop.train(settings(disk), say=lambda line: None)
+    assert result.finished
+    assert any("the checkpoint of update 8" in what for what in result.not_on_disk), result.not_on_disk
+    (disk / "filler").unlink()
+    during.clear()
+    assert arrays(settings(disk))[0] == 4
+    assert loop.train(settings(disk, resume=True), say=lambda line: None).not_on_disk == ()
+    require_same_run(settings(disk), undisturbed)
+
+
+@pytest.mark.slow
+def test_the_command_says_what_could_not_be_written(disk, during, capsys):
+    during[3] = lambda: fill(disk)
+    words = ["--ppo.num-envs", "4", "--ppo.unroll-length", "8", "--network.mlp-sizes", "8", "8", "--steps", "128"]
+    code = cli.main(["train", "--arch", "mlp", "--preset", "smoke", "--runs-dir", str(disk), "--run", "run", *words])
+    told = capsys.readouterr()
+    assert code == 1
+    assert "segvisrl train: could not be written: " in told.err
+    assert "the checkpoint of update 4" in told.err
+    assert "Traceback" not in told.err + told.out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("run", "resume"), [("run", True), ("second", False)])
+def test_a_read_only_disk_is_refused_in_one_line(run, resume, disk):
+    loop.train(settings(disk), say=lambda line: None)
+    subprocess.run(["mount", "-o", f"remount,ro,size={DISK_MB}m", str(disk)], check=True)
+    with pytest.raises(ConfigError, match=rf"run = '{disk}/{run}': cannot be written \(.*[Rr]ead-only"):
+        loop.train(settings(disk, run=run, resume=resume, steps=2 * NUM_UPDATES * 32), say=lambda line: None)
+    assert arrays_of_read_only(disk) == NUM_UPDATES
+
+
+def arrays_of_read_only(disk):
+    """The newest checkpoint's updates, by its folder: orbax opens none that it could not write to."""
+    load_policy(disk / "run" / "policy")
+    return max(int(path.name) for path in (disk / "run" / "checkpoints").iterdir())
+
+
+@pytest.mark.slow
+def test_a_folder_that_vanishes_is_made_again(tmp_path, during, undisturbed):
+    during[4] = lambda: shutil.rmtree(tmp_path / "run")
+    result = loop.train(settings(tmp_path), say=lambda line: None)
+    assert (result.finished, result.not_on_disk) == (True, ())
+    require_same_run(settings(tmp_path), undisturbed)
+
+
+@pytest.mark.parametrize("place", ["under a file", "/proc/nowhere"])
+def test_a_folder_that_cannot_be_made_is_refused_in_one_line(place, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    runs_dir = str(tmp_path / "file" / "runs") if place == "under a file" else place
+    assert cli.main(["train", "--arch", "mlp", "--preset", "smoke", "--runs-dir", runs_dir]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1, said
+    assert runs_dir in said
+    assert "should be" in said or "cannot be written" in said
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_without_permission_is_refused_in_one_line(tmp_path, capsys):
+    (tmp_path / "locked").mkdir(mode=0o500)
+    runs_dir = str(tmp_path / "locked" / "runs")
+    assert cli.main(["train", "--arch", "mlp", "--preset", "smoke", "--runs-dir", runs_dir]) == 2
+    assert "Permission denied" in capsys.readouterr().err

@@ -1,0 +1,135 @@
+"""SIGTERM and Ctrl-C end a training within ten seconds, saved, with a line that says how to go on: at any moment."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from segvisrl_jax.training.loggers import read_metrics
+from segvisrl_jax.training.run_lock import is_being_trained
+from segvisrl_jax.training.stop_signals import GRACE_S, StopSignals
+
+PATIENCE_S = 600.0
+ENDS_WITHIN_S = 10.0
+LONG_UPDATE = (  # one update takes minutes: 256 images of 192 x 108 in each of many gradient steps
+    "--arch", "cnn_lstm", "--preset", "cpu", "--env.camera.scale", "10", "--ppo.num-epochs", "64", "--ppo.kl-stop", "0",
+    "--checkpoint-every-updates", "1000", "--evaluation.episodes", "1",
+)  # fmt: skip
+SHORT = (
+    "--arch", "mlp", "--preset", "smoke", "--steps", "1000000", "--checkpoint-every-updates", "100000",
+    "--evaluation.every-decisions", "100000",
+)  # fmt: skip
+LONG_EVALUATION = (
+    "--arch", "mlp", "--preset", "smoke", "--evaluation.episodes", "100000", "--evaluation.num-slots", "4",
+    "--checkpoint-every-updates", "1000",
+)  # fmt: skip
+
+
+class Training:
+    """A training in a process of its own."""
+
+    def __init__(self, folder, *options):
+        self.run = folder / "run"
+        command = [sys.executable, "-m", "segvisrl_jax.cli", "train", "--runs-dir", str(folder), "--run", "run"]
+        environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONUNBUFFERED": "1"}
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+        restore = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler)}
+        self.process = subprocess.Popen([*command, *options], env=environment, **pipes, **restore)
+
+    def wait_until(self, condition):
+        until = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert self.process.poll() is None, self.process.communicate()[0]
+            assert time.monotonic() < until
+            time.sleep(0.05)
+
+    def num_lines(self):
+        file = self.run / "metrics.jsonl"
+        return len(read_metrics(self.run)) if file.exists() else 0
+
+    def stop(self, number):
+        """(seconds until it ended, exit code, what it said)."""
+        began = time.monotonic()
+        self.process.send_signal(number)
+        said, _ = self.process.communicate(timeout=PATIENCE_S)
+        return time.monotonic() - began, self.process.returncode, said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_between_updates_all_of_them_are_saved(number, tmp_path):
+    training = Training(tmp_path, *SHORT)
+    training.wait_until(lambda: training.num_lines() >= 3)
+    seconds, code, said = training.stop(number)
+    assert (code, seconds < ENDS_WITHIN_S) == (130, True), (code, seconds, said)
+    decisions = read_metrics(training.run)[-1]["step"]
+    assert f"Stopped and saved after {decisions:,} decisions. Go on with:\n" in said
+    assert said.rstrip().endswith(f"segvisrl train --resume --runs-dir {tmp_path} --run run")
+    assert "Traceback" not in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("options", "lines"), [(LONG_UPDATE, 0), (LONG_EVALUATION, 1)])
+def test_what_takes_too_long_is_left(options, lines, tmp_path):
+    """The first update, which compiles, and an evaluation: neither would end in time."""
+    training = Training(tmp_path, *options)
+    training.wait_until(lambda: is_being_trained(training.run) and training.num_lines() >= lines)
+    time.sleep(GRACE_S)
+    seconds, code, said = training.stop(signal.SIGTERM)
+    assert (code, seconds < ENDS_WITHIN_S) == (130, True), (code, seconds, said)
+    assert "Stopped" in said
+    assert said.rstrip().endswith(f"segvisrl train --resume --runs-dir {tmp_path} --run run")
+    if lines:
+        [saved] = re.findall(r"saved are ([\d,]+) decisions", said)
+        assert int(saved.replace(",", "")) == read_metrics(training.run)[-1]["step"]
+        assert [path.name for path in (training.run / "checkpoints").iterdir()] == [str(training.num_lines())]
+
+
+@pytest.mark.slow
+def test_a_second_signal_ends_at_once_and_the_checkpoint_stays(tmp_path):
+    training = Training(tmp_path, *LONG_EVALUATION[:-1], "1")
+    training.wait_until(lambda: (training.run / "checkpoints" / "1" / "manifest.json").exists())
+    time.sleep(1.0)
+    training.process.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    seconds, code, said = training.stop(signal.SIGINT)
+    assert (code, seconds < GRACE_S / 2) == (130, True), (code, seconds, said)
+    assert "Traceback" not in said
+    assert (training.run / "checkpoints" / "1" / "manifest.json").exists()
+
+
+def test_handlers_are_put_back(tmp_path):
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    with StopSignals(late=lambda at_once: None) as stop:
+        assert not stop.requested
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_a_signal_that_is_answered_in_time_is_not_late():
+    late = []
+    with StopSignals(grace_s=30.0, late=late.append) as stop:
+        signal.raise_signal(signal.SIGTERM)
+        assert stop.requested
+    assert late == []
+
+
+def test_who_takes_too_long_is_called(tmp_path):
+    late = []
+    with StopSignals(grace_s=0.05, late=late.append):
+        signal.raise_signal(signal.SIGTERM)
+        time.sleep(0.5)
+    assert late == [False]
+
+
+def test_the_second_signal_does_not_wait():
+    late = []
+    with StopSignals(grace_s=30.0, late=late.append):
+        signal.raise_signal(signal.SIGINT)
+        time.sleep(0.1)
+        signal.raise_signal(signal.SIGINT)
+        time.sleep(0.5)
+    assert late == [True]

@@ -1,0 +1,65 @@
+"""One process at a time in a run's folder; the lock ends with its process, also where that is killed."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from segvisrl_jax.config import ConfigError, preset_config, replace_fields
+from segvisrl_jax.training import loop
+from segvisrl_jax.training.run_lock import RunLock, is_being_trained
+
+PATIENCE_S = 300.0
+HOLD = "import sys, time; from pathlib import Path; from segvisrl_jax.training.run_lock import RunLock\n"
+HOLD += "lock = RunLock(Path(sys.argv[1])); print('held', flush=True); time.sleep(600)"
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """Another process, which holds the folder."""
+    process = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "held\n"
+    yield process
+    process.kill()
+    process.wait()
+
+
+def test_the_second_is_refused_until_the_first_is_gone(holder, tmp_path):
+    assert is_being_trained(tmp_path)
+    with pytest.raises(ConfigError, match="another process is training it"):
+        RunLock(tmp_path)
+    holder.send_signal(signal.SIGKILL)
+    holder.wait()
+    assert not is_being_trained(tmp_path)
+    RunLock(tmp_path).close()
+
+
+def test_a_folder_without_a_run_is_not_being_trained(tmp_path):
+    assert not is_being_trained(tmp_path)
+    assert not is_being_trained(tmp_path / "nowhere")
+
+
+@pytest.mark.slow
+def test_a_run_that_trains_cannot_be_resumed_beside_itself(tmp_path):
+    words = ["--arch", "mlp", "--preset", "smoke", "--steps", "100000", "--runs-dir", str(tmp_path), "--run", "run"]
+    command = [sys.executable, "-m", "segvisrl_jax.cli", "train", *words]
+    first = subprocess.Popen(command, env={**os.environ, "JAX_PLATFORMS": "cpu"}, stdout=subprocess.DEVNULL)
+    try:
+        until = time.monotonic() + PATIENCE_S
+        while not is_being_trained(tmp_path / "run") and time.monotonic() < until:
+            time.sleep(0.1)
+        before = sorted(path for path in (tmp_path / "run").rglob("config.json"))
+        second = subprocess.run([*command, "--resume"], capture_output=True, text=True)
+        assert second.returncode == 2
+        assert second.stderr.count("\n") == 1, second.stderr
+        assert "another process is training it" in second.stderr
+        assert sorted(path for path in (tmp_path / "run").rglob("config.json")) == before
+        assert first.poll() is None
+    finally:
+        first.kill()
+        first.wait()
+    config = replace_fields(preset_config("mlp", "smoke"), runs_dir=str(tmp_path), run="run", steps=100000)
+    assert loop.open_run_dirs(replace_fields(config, resume=True)) is None
