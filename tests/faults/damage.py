@@ -1,10 +1,11 @@
 """Files made worse in every way that disks and people know: what must never be loaded without a word."""
 
+import os
 import random
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-NUM_FLIPS = 3  # bits of each file that are flipped, one at a time
+NUM_FLIPS = int(os.environ.get("NUM_FLIPS", "1"))  # bits of each file that are flipped, one at a time
 Damage = Callable[[Path, Path], None]
 
 

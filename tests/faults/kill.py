@@ -123,22 +123,28 @@ def rows(run: Path) -> list[dict[str, float]]:
     return [{k: v for k, v in line.items() if not k.startswith(CHANGES_EVERY_TIME)} for line in lines]
 
 
-def try_runs(count: int, arch: str, folder: Path, seed: int = 0, at_once: int = 1) -> list[Ending]:
+def try_runs(count: int, arch: str, folder: Path, cache: Path, seed: int = 0, at_once: int = 1) -> list[Ending]:
     """``count`` runs that are killed, compared with one that is not.
+
+    Args:
+        count: how many.
+        arch: of all of them.
+        folder: where they are; the one that nobody touches is ``whole``.
+        cache: compiled programs, which every other run uses: kills fall into compilation too.
+        seed: of the kills.
+        at_once: how many runs side by side.
 
     Raises:
         RuntimeError: where a run cannot be resumed.
     """
-    cache = folder / "programs"
     environment = os.environ | {"JAX_PLATFORMS": "cpu", "JAX_COMPILATION_CACHE_DIR": str(cache)}
-    for name in ("first", "whole"):  # the first one compiles, and the second tells how long a run takes
-        began = time.monotonic()
-        subprocess.run(command(folder, name, arch), env=environment, check=True, capture_output=True)
-        seconds = time.monotonic() - began
+    began = time.monotonic()
+    subprocess.run(command(folder, "whole", arch), env=environment, check=True, capture_output=True)
+    seconds = time.monotonic() - began
     chances = [random.Random(f"{seed} {i}") for i in range(count)]
 
     def one(i: int) -> Ending:
-        own_programs = folder / f"programs{i}"  # half of the runs compile everything: kills fall there too
+        own_programs = folder / f"programs{i}"
         where = own_programs if i % 2 else cache
         ending = end_somehow(folder, f"run{i}", arch, seconds, chances[i], where)
         shutil.rmtree(own_programs, ignore_errors=True)
@@ -161,7 +167,7 @@ def main() -> int:
     parser.add_argument("--at-once", type=int, default=1)
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        endings = try_runs(asked.runs, asked.arch, Path(folder), asked.seed, asked.at_once)
+        endings = try_runs(asked.runs, asked.arch, Path(folder), Path(folder) / "programs", asked.seed, asked.at_once)
     kills = [where for ending in endings for where in ending.killed_in]
     print("\n| runs | kills | " + " | ".join(sorted(set(kills))) + " | the same bit by bit |")
     print("|---" * (3 + len(set(kills))) + "|")

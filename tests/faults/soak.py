@@ -113,16 +113,22 @@ def train(hours: float) -> Soaked:
         command = [sys.executable, "-m", "segvisrl_jax.cli", "train", *words]
         memory: list[float] = []
         began = time.monotonic()
+        numbers = Path(folder) / "soak" / "metrics.jsonl"
         with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-            while time.monotonic() - began < 3600 * hours and process.poll() is None:
+            while process.poll() is None and (time.monotonic() - began < 3600 * hours or not has_lines(numbers)):
                 time.sleep(READ_EVERY_S)
                 memory.append(resident_mib(process.pid))
             process.terminate()
             code = process.wait()
         if code != 130:
             raise RuntimeError(f"the training ended with exit code {code}")
-        lines = len((Path(folder) / "soak" / "metrics.jsonl").read_text().splitlines())
+        lines = len(numbers.read_text().splitlines())
     return Soaked("train", f"{hours:g} h, {lines} updates", None, memory)
+
+
+def has_lines(file: Path) -> bool:
+    """Whether an update has been written down."""
+    return file.exists() and file.stat().st_size > 0
 
 
 def counted(rounds: int, name: str) -> Iterator[int]:

@@ -1,6 +1,7 @@
 """Every file of a checkpoint, a run and a policy, damaged in every way: named, or made up for by what is whole.
 
-Each test goes through all cases of its kind and counts them: the two together are more than 200.
+Each test goes through all cases of its kind. ``NUM_FLIPS=3 pytest -s tests/faults/test_damaged_files.py`` tries more bits
+of each file, and prints how many cases there were.
 """
 
 import json
@@ -21,7 +22,7 @@ from segvisrl_jax.training.metrics import read_metrics
 
 SMALL = {"num_envs": 4, "unroll_length": 8, "num_minibatches": 2, "max_decisions": 10, "mlp_sizes": (8, 8)}
 QUIET = {"say": lambda line: None}
-NUM_CHECKPOINT_CASES, NUM_POLICY_CASES = 100, 100  # at least
+NUM_CHECKPOINT_CASES, NUM_POLICY_CASES = 60, 10  # at least
 
 
 def settings(runs_dir, **more):
@@ -70,7 +71,7 @@ def damage(folder: Path, others: Path, name: str, kind: str) -> None:
 
 @pytest.mark.slow
 def test_the_checkpoint_before_a_damaged_one_is_used(runs, empty_state, tmp_path):
-    newest, before, other = (runs / run / "checkpoints" for run in ("run/", "run", "other"))
+    newest, other = (runs / run / "checkpoints" for run in ("run", "other"))
     shutil.copytree(runs / "run", tmp_path / "older")
     shutil.rmtree(tmp_path / "older" / "checkpoints" / "3")
     updates, expected, _ = restored(tmp_path / "older", empty_state)
@@ -91,8 +92,8 @@ def test_the_checkpoint_before_a_damaged_one_is_used(runs, empty_state, tmp_path
         assert (run / DAMAGED_FOLDER / "3").is_dir() != is_unfinished, where
         shutil.rmtree(run)
         tried += 1
+    print(f"checkpoint: {tried} cases")
     assert tried >= NUM_CHECKPOINT_CASES
-    assert before == newest
 
 
 @pytest.mark.slow
@@ -164,7 +165,8 @@ def test_a_damaged_policy_is_refused_and_its_file_named(name, tmp_path):
             load_policy(policy)
         shutil.rmtree(policy)
         tried += 1
-    assert tried >= NUM_POLICY_CASES // 10
+    print(f"policy {name}: {tried} cases")
+    assert tried >= NUM_POLICY_CASES
 
 
 @pytest.mark.slow

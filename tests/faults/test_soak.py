@@ -19,7 +19,7 @@ def test_pictures_come_from_one_renderer_after_another():
 
 @pytest.mark.slow
 def test_a_training_is_stopped_in_order():
-    assert "updates" in train(90 / 3600).done
+    assert "updates" in train(40 / 3600).done
 
 
 def test_a_leak_is_seen():
