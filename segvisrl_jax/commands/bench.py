@@ -15,13 +15,16 @@ from segvisrl_jax.cli import parse
 from segvisrl_jax.config import (
     IMAGE_OBSERVATIONS,
     Arch,
+    CameraConfig,
     ConfigError,
     EngineName,
     EnvConfig,
     PresetName,
+    SceneConfig,
     preset_config,
     replace_fields,
     require,
+    require_file_can_be_written,
 )
 from segvisrl_jax.machine.growth import GrowthSizes
 
@@ -64,9 +67,12 @@ class BenchOptions:
         for batch in self.batches:
             require(1 <= batch <= 65536, "--batches", batch, "in [1, 65536]")
         require(1 <= self.repeats <= 1000, "--repeats", self.repeats, "in [1, 1000]")
+        CameraConfig(scale=self.scale)
+        for num_rocks in self.num_rocks:
+            SceneConfig(num_rocks=num_rocks)
         for option, path in (("--json", self.json), ("--plot", self.plot)):
-            folder_exists = path is None or path.resolve().parent.is_dir()
-            require(folder_exists, option, str(path), "in a folder that exists")
+            if path is not None:
+                require_file_can_be_written(path, option)
         if self.plot is not None:
             require("growth" in self.parts, "--plot", str(self.plot), "left out without the part growth")
             require(self.plot.suffix == ".png", "--plot", str(self.plot), "a name that ends in .png")
