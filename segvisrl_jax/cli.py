@@ -120,7 +120,7 @@ def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: O
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise _config_error(stop) or ConfigError(_in_our_words(_one_line(said.getvalue()), words, command)) from None
+        raise _config_error(stop) or ConfigError(_in_our_words(_one_line(said.getvalue()), words)) from None
 
 
 def _config_error(error: BaseException | None) -> ConfigError | None:
@@ -149,7 +149,7 @@ def _one_line(message: str) -> str:
     return " ".join(paragraph)
 
 
-def _in_our_words(complaint: str, words: Sequence[str], command: str) -> str:
+def _in_our_words(complaint: str, words: Sequence[str]) -> str:
     """tyro's complaint as all others are: the option, its value, what would be right; as it is where it is unknown."""
     for pattern, should in COMPLAINTS.items():
         found = re.fullmatch(pattern, complaint)
@@ -165,7 +165,7 @@ def _in_our_words(complaint: str, words: Sequence[str], command: str) -> str:
     before = words[words.index(first) - 1] if first in words[1:] else ""
     if before.startswith("--") and not first.startswith("-"):
         return f"{before} = {first!r}: should be left out; {before} takes no value"
-    return f"{unknown[1]}: should be left out; segvisrl {command} --help lists the options"
+    return f"{unknown[1]}: should be left out; --help lists the options"
 
 
 def _as_typed(value: str, words: Sequence[str]) -> str:
