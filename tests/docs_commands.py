@@ -5,6 +5,7 @@ page says, but for the sizes in ``TINY`` and ``TRAINING``. Those that no test ca
 """
 
 import contextlib
+import functools
 import os
 import re
 import shlex
@@ -39,9 +40,13 @@ TINY = {  # options by what is run, in place of the page's or beside them
     "train": TRAINING,
     "eval": {"--episodes": "4"},
     "bench": {"--repeats": "1", "--batch": "2", "--batches": "2", "--preset": "smoke"},
+    "growth": {"--growth.rocks": "1", "--growth.envs": "2", "--growth.scales": "120", "--growth.unrolls": "8"},
     "report": {"--episodes": "4", "--videos": "1"},
     "sweep": {"--preset": "smoke", "--args": "--env.task.max-decisions 20"},
     "trajectories.py": {"--episodes": "2"},
+    "kill.py": {"--runs": "1"},
+    "fuzz.py": {"--examples": "280"},
+    "soak.py": {"--native-decisions": "1", "--mjx-decisions": "1", "--frames": "1", "--hours": "0.01"},
     "failures.py": {"--episodes": "4"},
     "visual_gap.py": {"--episodes": "2", "--severities": "1", "--kinds": "class-flip-share"},
 }
@@ -101,6 +106,8 @@ def shrunk(words: tuple[str, ...]) -> list[str]:
     if asked[0] == "pytest":
         return [*asked, "-q", "-x", "-m", "not slow"]
     kind = asked[1].rpartition("/")[2] if asked[0] == "python" else asked[1]
+    if "growth" in asked:
+        asked = functools.reduce(lambda words, item: put(words, *item), TINY["growth"].items(), asked)
     if kind in POSITIONAL:
         return [*asked[:2], POSITIONAL[kind]]
     if asked[0] == "srun":
