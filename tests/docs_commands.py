@@ -104,7 +104,7 @@ def shrunk(words: tuple[str, ...]) -> list[str]:
     if asked[0] in ("pip", ".venv/bin/pip"):
         return [*asked, "--dry-run", "--quiet"]
     if asked[0] == "pytest":
-        return [*asked, "-q", "-x", "-m", "not slow"]
+        return [*asked, "-q", "-x", *([] if "faults" in asked[1] else ["-m", "not slow"])]
     kind = asked[1].rpartition("/")[2] if asked[0] == "python" else asked[1]
     if "growth" in asked:
         asked = functools.reduce(lambda words, item: put(words, *item), TINY["growth"].items(), asked)

@@ -116,7 +116,7 @@ class PPOConfig:
         require(0 < scale <= 1e6, f"{p}.reward_scale", scale, "positive, and at most 1e6")
         for name in ("entropy_cost", "value_cost", "kl_stop", "kl_target"):
             value = getattr(self, name)
-            require(0 <= value <= 1e6, f"{p}.{name}", value, "0 or more, and at most 1e6")
+            require(0 <= value <= 1e9, f"{p}.{name}", value, "0 or more, and at most 1e9")
 
 
 @dataclass(frozen=True)
