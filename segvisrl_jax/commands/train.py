@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from segvisrl_jax.cli import INTERRUPTED, parse
+from segvisrl_jax.cli import FAILURE, INTERRUPTED, parse
 from segvisrl_jax.config import (
     IMAGE_OBSERVATIONS,
     ConfigError,
@@ -24,7 +24,6 @@ from segvisrl_jax.config import (
     to_dict,
 )
 
-FAILED = 1
 SHOW_CURSOR = "\x1b[?25h"
 TEST_EPISODES = 200  # driven after training, on scenes that neither training nor the choice of the policy saw
 
@@ -46,12 +45,12 @@ def run(options: Sequence[str]) -> int:
             result = train(config, when_late=lambda said: _end_now(f"{said} {going_on}"))
     except DivergedError as error:
         print(f"segvisrl train: {error}", file=sys.stderr)
-        return FAILED
+        return FAILURE
     if not is_first:
         return 0 if result.finished else INTERRUPTED
     if result.not_on_disk:
         print(f"segvisrl train: could not be written: {'; '.join(result.not_on_disk)}", file=sys.stderr)
-        return FAILED
+        return FAILURE
     if not result.finished:
         print(f"Stopped and saved after {result.decisions:,} decisions. {going_on}")
         return INTERRUPTED

@@ -176,7 +176,7 @@ def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | N
         DivergedError: where no loss or gradient was finite for ``max_bad_updates`` updates.
     """
     processes = join(config)
-    first_params = _params_to_start_from(config)
+    first_params = None if config.resume else _params_to_start_from(config)
     require_installed(config.loggers)
     processes.on_first(lambda: open_run_dirs(config))
     with contextlib.ExitStack() as stack:
@@ -203,9 +203,7 @@ def _say_nothing(line: str) -> None:
 
 
 def _params_to_start_from(config: TrainConfig) -> Params | None:
-    folders = [Path(run.runs_dir) / run.run_name / "checkpoints" for run in config.runs]
-    has_begun = config.resume and all(any(folder.glob("[0-9]*")) for folder in folders)
-    if not config.start_from or has_begun:
+    if not config.start_from:
         return None
     source, params, _ = load_policy(Path(config.start_from))
     for name, ours, theirs in (
@@ -254,15 +252,14 @@ class _Session:
         return self._updates >= config.num_updates
 
     def _start(self, first_params: Params | None) -> TrainingState:
-        begun = [run.num_saved is not None for run in self.runs]
-        going_on = self.config.resume and all(begun)
-        state = self.trainer.start(None if going_on else first_params)
         if not self.config.resume:
-            return state
+            return self.trainer.start(first_params)
+        begun = [run.num_saved is not None for run in self.runs]
         if not any(begun):
             self.runs[0].say("nothing was saved yet: starting at the beginning")
-            return state
+            return self.trainer.start(_params_to_start_from(self.config))
         require(all(begun), "num_seeds", len(self.runs), "1, for each run by itself: not all of them have a checkpoint")
+        state = self.trainer.start()
         restored = [run.restore(self.trainer.of_seed(state, i)) for i, run in enumerate(self.runs)]
         reached = [run.host.updates for run in self.runs]
         same = len(set(reached)) == 1
@@ -271,7 +268,7 @@ class _Session:
 
     def end_late(self, end: Callable[[str], object], at_once: bool) -> None:
         """In the watching thread: saves the state before the update that takes too long, and ends the process."""
-        with self._saving:
+        with contextlib.nullcontext() if at_once else self._saving:  # what is being written is whole or unfinished
             if self._whole is not None and not at_once and not self._bad_updates:
                 state, hosts = self._whole
                 for i, (run, host) in enumerate(zip(self.runs, hosts, strict=True)):

@@ -117,6 +117,20 @@ def test_training_starts_from_a_policy_where_one_is_named(config, tmp_path):
     assert again.runs_dir == "runs"
 
 
+def test_a_run_that_ended_before_its_first_checkpoint_starts_from_its_policy_again(config, tmp_path):
+    """Also where that checkpoint was being written."""
+    given = replace_fields(config, run="second", start_from=str(tmp_path / "run" / "policy"))
+    loop.train(given, **QUIET)
+    expected, _ = final_state(given)
+    for left in (tmp_path / "second" / "checkpoints").iterdir():
+        shutil.rmtree(left)
+    (tmp_path / "second" / "checkpoints" / "2.orbax-checkpoint-tmp-0").mkdir()
+    loop.train(replace_fields(given, resume=True), **QUIET)
+    found, _ = final_state(given)
+    for ours, theirs in zip(as_arrays(found), as_arrays(expected), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
 @pytest.mark.parametrize(
     ("field", "message"),
     [({"mlp_sizes": (9,)}, "network"), ({"scale": 60.0}, "observations"), ({"start_from": "nowhere"}, "policy.json")],
