@@ -19,9 +19,9 @@ def require_file_can_be_written(path: Path, name: str, should: str = "in a folde
     shown = str(path)
     require(is_path(shown), name, shown, A_PATH)
     folder = path.resolve().parent
-    require(folder.is_dir(), name, shown, should)
-    require(not path.is_dir(), name, shown, "a file; this is a folder")
-    place = path if path.exists() else folder
+    require(os.path.isdir(folder), name, shown, should)
+    require(not os.path.isdir(path), name, shown, "a file; this is a folder")
+    place = path if os.path.exists(path) else folder
     require(os.access(place, os.W_OK), name, shown, "where this user may write")
 
 
@@ -29,6 +29,7 @@ def require_folder_can_be_made(path: Path, name: str) -> None:
     """Raises ``ConfigError`` unless it is a folder that can be written to, or can be made where there is nothing."""
     shown = str(path)
     require(is_path(shown), name, shown, A_PATH)
-    existing = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
+    above = (path.absolute(), *path.absolute().parents)
+    existing = next(place for place in above if os.path.exists(place))  # pathlib raises where it may not look
     require(existing.is_dir(), name, shown, f"a folder; {existing} is a file")
     require(os.access(existing, os.W_OK | os.X_OK), name, shown, f"where this user may write; {existing} is not")
