@@ -6,6 +6,7 @@ page says, but for the sizes in ``TINY`` and ``TRAINING``. Those that no test ca
 
 import contextlib
 import functools
+import json
 import os
 import re
 import shlex
@@ -172,7 +173,9 @@ class Reader:
         for name, code in SLURM.items():
             (stand_ins / name).write_text(f"#!/bin/sh\n{code}\n")
             (stand_ins / name).chmod(0o755)
-        self.environment = os.environ | {
+        of_make = ("MAKEFLAGS", "MFLAGS", "MAKEOVERRIDES")  # what ``make test-docs ARGS=...`` was given is not for them
+        inherited = {name: value for name, value in os.environ.items() if name not in of_make}
+        self.environment = inherited | {
             "PATH": os.pathsep.join([str(BIN), str(stand_ins), os.environ["PATH"]]),
             "PYTHONPATH": str(folder),
             "JAX_PLATFORMS": "cpu",
@@ -189,9 +192,14 @@ class Reader:
             named = [words[words.index("--run") + 1]]
         if "--output" in words:
             return
-        for name in named:
-            if not (self.folder / "runs" / name).exists():
-                shutil.copytree(self.run, self.folder / "runs" / name)
+        for seed, name in enumerate(named):
+            folder = self.folder / "runs" / name
+            if folder.exists():
+                continue
+            shutil.copytree(self.run, folder)
+            if seed:  # runs side by side are of several seeds
+                config = json.loads((folder / "config.json").read_text())
+                (folder / "config.json").write_text(json.dumps(config | {"seed": seed}))
 
     def makes_room(self, words: list[str]) -> None:
         """Removes the run that a page's earlier command made, where this one makes it anew."""
