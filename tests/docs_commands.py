@@ -207,6 +207,10 @@ class Reader:
             given = dict(word.split("=", 1) for word in words[2:])
             train = ["--arch", given.get("ARCH", "cnn_lstm"), "--seed", given.get("SEED", "0")]
             train += ["--run", given["RUN"]] if "RUN" in given else []
+        elif words[0] == "srun":  # whose command is one word, for a shell
+            name = re.search(r"--run (\S+)", words[-1])[1]
+            shutil.rmtree(self.folder / "runs" / name, ignore_errors=True)
+            return
         elif words[:2] == ["segvisrl", "train"] and not {"--resume", "--help", "--process-id"} & set(words):
             train = words[2:]
         else:
