@@ -87,7 +87,7 @@ test: $(READY) ## the whole suite, on the CPU, in WORKERS processes
 test-fast: $(READY) ## the edit loop: everything but the slow tests
 	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow" $(ARGS)
 
-test-docs: $(EXTRAS_READY) ## run every command of the README and the documentation, at a tiny size (an hour)
+test-docs: $(EXTRAS_READY) ## run every command of the README and the documentation, at a tiny size (an hour and a half)
 	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -q -n $(WORKERS) tests/docs_commands.py $(ARGS)
 
 check: $(READY) ## format, lint, types, fast tests (TESTED=1: without the tests)

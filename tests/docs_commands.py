@@ -1,6 +1,6 @@
 """Every command of README.md and docs/ really runs, at a tiny size, in a copy of this tree: ``make test-docs``.
 
-``make test`` only parses most of them (``test_docs.py``): all of them take half an hour or more. A command is what its
+``make test`` only parses most of them (``test_docs.py``): all of them take an hour and a half. A command is what its
 page says, but for the sizes in ``TINY`` and ``TRAINING``. Those that no test can run are in ``NOT_RUN``, with reasons.
 """
 

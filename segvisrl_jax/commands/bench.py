@@ -99,7 +99,7 @@ def run(options: Sequence[str]) -> int:
         measured = []
         for row in measure[part](asked):
             measured.append(row)
-            print(f"{part}: {len(measured)} rows measured", end="\r", file=sys.stderr, flush=True)
+            print(f"{part}: rows measured: {len(measured)}", end="\r", file=sys.stderr, flush=True)
         _print_table(part, measured)
         rows += [{"part": part, **row} for row in measured]
         if part == "growth":

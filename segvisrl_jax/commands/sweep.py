@@ -99,7 +99,8 @@ def _train(asked: SweepOptions, missing: "Sequence[Trial]", note: "Callable[[Tri
     columns = (TextColumn("sweep"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns) as progress:
         bar = progress.add_task("sweep", total=len(missing))
-        progress.console.print(f"{len(missing)} runs; logs in {asked.output}", highlight=False)
+        counted = f"{len(missing)} run{'' if len(missing) == 1 else 's'}"
+        progress.console.print(f"{counted}; logs in {asked.output}", highlight=False)
         for trial, ended in _ends(asked, missing):
             if ended.code in (INTERRUPTED, -signal.SIGINT):
                 raise KeyboardInterrupt
