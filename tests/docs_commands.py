@@ -6,7 +6,6 @@ page says, but for the sizes in ``TINY`` and ``TRAINING``. Those that no test ca
 
 import contextlib
 import functools
-import json
 import os
 import re
 import shlex
@@ -160,8 +159,8 @@ def free_port() -> int:
 class Reader:
     """Somebody in a copy of this tree who types what a page says."""
 
-    def __init__(self, folder: Path, run: Path) -> None:
-        self.folder, self.run, self.failures, self.said = folder, run, [], []
+    def __init__(self, folder: Path, runs: list[Path]) -> None:
+        self.folder, self.runs, self.failures, self.said = folder, runs, [], []
         tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True)
         for name in filter(None, tracked.stdout.split("\0")):
             if (ROOT / name).is_file():
@@ -192,14 +191,9 @@ class Reader:
             named = [words[words.index("--run") + 1]]
         if "--output" in words:
             return
-        for seed, name in enumerate(named):
-            folder = self.folder / "runs" / name
-            if folder.exists():
-                continue
-            shutil.copytree(self.run, folder)
-            if seed:  # runs side by side are of several seeds
-                config = json.loads((folder / "config.json").read_text())
-                (folder / "config.json").write_text(json.dumps(config | {"seed": seed}))
+        for seed, name in enumerate(named):  # those side by side are of several seeds
+            if not (self.folder / "runs" / name).exists():
+                shutil.copytree(self.runs[seed % len(self.runs)], self.folder / "runs" / name)
 
     def makes_room(self, words: list[str]) -> None:
         """Removes the run that a page's earlier command made, where this one makes it anew."""
@@ -249,12 +243,14 @@ class Reader:
 
 
 @pytest.fixture(scope="session")
-def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of the preset ``cpu``, as a reader may have one."""
-    folder = tmp_path_factory.mktemp("run")
+def finished_runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Runs of the preset ``cpu``, as a reader may have them."""
+    folder = tmp_path_factory.mktemp("runs")
     words = [str(BIN / "segvisrl"), "train", "--arch", "cnn_lstm", "--preset", "cpu", "--runs-dir", str(folder)]
-    subprocess.run([*words, "--run", "tiny", *SHORT.split()], check=True, env=os.environ | {"JAX_PLATFORMS": "cpu"})
-    return folder / "tiny"
+    for seed in ("0", "1"):
+        own = ["--seed", seed, "--run", seed]
+        subprocess.run([*words, *own, *SHORT.split()], check=True, env=os.environ | {"JAX_PLATFORMS": "cpu"})
+    return [folder / "0", folder / "1"]
 
 
 def to_run(page: Path) -> list[list[tuple[Command, list[str]]]]:
@@ -287,8 +283,8 @@ def named_in_a_sentence(page: Path, command: Command) -> bool:
 
 
 @pytest.mark.parametrize("page", [pytest.param(page, id=name_of(page)) for page in listed()])
-def test_every_command_runs(page: Path, tmp_path: Path, finished_run: Path):
-    reader = Reader(tmp_path, finished_run)
+def test_every_command_runs(page: Path, tmp_path: Path, finished_runs: list[Path]):
+    reader = Reader(tmp_path, finished_runs)
     for block in blocks(page.read_text()):
         if block.language == "diff":
             reader.change(block.code)
