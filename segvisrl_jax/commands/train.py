@@ -102,8 +102,8 @@ def _stored_config(runs_dir: str, run_name: str) -> TrainConfig | None:
         stored = from_dict(TrainConfig, read_json(file))
     except (OSError, ValueError) as error:
         raise ConfigError(f"{file}: not a run's settings ({error})") from None
-    here = {"runs_dir": runs_dir}  # not where it began: runs are moved, from a cluster for one
-    return replace_fields(stored, coordinator="", num_processes=1, process_id=0, **here)  # who goes on, says so
+    # The folder is where the run is now, not where it began; processes are those that go on.
+    return replace_fields(stored, runs_dir=runs_dir, coordinator="", num_processes=1, process_id=0)
 
 
 def preset_for_this_machine() -> PresetName:

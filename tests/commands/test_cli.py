@@ -8,6 +8,8 @@ import sys
 import pytest
 
 from segvisrl_jax.cli import main
+from segvisrl_jax.commands.train import parse_config
+from segvisrl_jax.config import preset_config, replace_fields, to_dict
 
 PROGRAM = [sys.executable, "-m", "segvisrl_jax.cli"]
 SMOKE = ["--preset", "smoke", "--steps", "256", "--env.task.max-decisions", "20"]  # short videos
@@ -226,3 +228,13 @@ def test_controllers_need_no_images(tmp_path):
     assert result["success"] > 0.75
     low, high = result["success_ci95"]
     assert 0 <= low <= result["success"] <= high <= 1
+
+
+def test_a_run_that_was_moved_goes_on_where_it_is(tmp_path, monkeypatch):
+    began = replace_fields(preset_config("mlp", "smoke"), runs_dir="/scratch/runs", run="before", seed=3)
+    folder = tmp_path / "runs" / "moved"
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text(json.dumps(to_dict(began)))
+    monkeypatch.chdir(tmp_path)
+    goes_on = parse_config(["--resume", "--run", "moved"])
+    assert (goes_on.runs_dir, goes_on.run, goes_on.seed) == ("runs", "moved", 3)

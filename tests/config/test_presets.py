@@ -1,11 +1,8 @@
 """Presets hold what they say: the paper's table, and training scenes that differ from the held-out ones."""
 
-import json
-
 import pytest
 
-from segvisrl_jax.commands.train import parse_config
-from segvisrl_jax.config import ConfigError, preset_config, replace_fields, to_dict
+from segvisrl_jax.config import ConfigError, preset_config, replace_fields
 from segvisrl_jax.training.loop import held_out_env, validation_env
 
 ARCHS = ["cnn_lstm", "cnn", "cnn_lstm_raw", "mlp", "mlp_rocks"]
@@ -77,13 +74,3 @@ def test_most_rocks_must_fit_and_have_shapes():
     large = {"rock_radius_min_m": 0.45, "rock_radius_max_m": 0.45, "num_rocks": 0, "random_num_rocks_max": 9}
     with pytest.raises(ConfigError, match=r"scene\.random_num_rocks_max = 9: .*without overlap"):
         replace_fields(preset_config("mlp", "smoke"), **narrow, **large)
-
-
-def test_a_run_that_was_moved_goes_on_where_it_is(tmp_path, monkeypatch):
-    began = replace_fields(preset_config("mlp", "smoke"), runs_dir="/scratch/runs", run="before", seed=3)
-    folder = tmp_path / "runs" / "moved"
-    folder.mkdir(parents=True)
-    (folder / "config.json").write_text(json.dumps(to_dict(began)))
-    monkeypatch.chdir(tmp_path)
-    goes_on = parse_config(["--resume", "--run", "moved"])
-    assert (goes_on.runs_dir, goes_on.run, goes_on.seed) == ("runs", "moved", 3)
