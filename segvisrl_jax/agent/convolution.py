@@ -1,125 +1,58 @@
 """The 3 x 3 convolution and the max-pool of the Impala CNN, in the forms that are fast on a CPU.
 
-Both equal flax's own layers in value; the convolution also in gradient. Accelerators run XLA's own convolution.
+Both equal flax's own layers in value and gradient. A CPU runs our own kernels (kernels.py); accelerators run XLA's
+operations, and so does a CPU where llvmlite, which compiles the kernels, is not installed.
 """
 
-from collections.abc import Sequence
-from typing import Any
+import functools
+from collections.abc import Callable
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float32
 
+kernels: ModuleType | None
+try:
+    from segvisrl_jax.agent import kernels
+except ImportError:
+    kernels = None
+
 CONVOLVED = "convolved"  # name of what a gradient must keep where it keeps little (``jax.checkpoint``)
 LAYOUT = ("NHWC", "HWIO", "NHWC")  # as flax.linen.Conv
 WINDOW = (3, 3)  # Impala's (Espeholt et al., 2018)
 POOL_WINDOW, POOL_STRIDE = 3, 2  # Impala's max-pool
-NARROW = 16  # channels; XLA's CPU backend hands wider convolutions to a library that is twice as fast
-# Where a kernel's gradient is taken by stacked shifts: measured faster than XLA's at 16 channels and slower at 3,
-# faster at 32 channels for 27 x 48 and slower for 14 x 24; limits lie between. So many pixels at a time fit the cache.
-FEWEST_STACKED, LEAST_STACKED_PIXELS, STACKED_PIXELS = 8, 24 * 48, 54 * 96
 
 Images = Float32[Array, "N H W C"]
 Kernel = Float32[Array, "3 3 C D"]
+Bias = Float32[Array, " D"]
+Result = Float32[Array, "N H W D"]
+Pooled = Float32[Array, "N H2 W2 C"]
 
 
-@jax.custom_vjp
-def convolution(images: Images, kernel: Kernel) -> Float32[Array, "N H W D"]:
-    """3 x 3 convolution with stride 1 and SAME padding, without bias."""
-    return _convolution(images, kernel)
+def convolution(images: Images, kernel: Kernel, bias: Bias, rectify: bool) -> Result:
+    """3 x 3 convolution, stride 1, SAME padding, of the images or, where ``rectify``, of what relu leaves of them."""
+    return checkpoint_name(_convolution(images, kernel, bias, rectify), CONVOLVED)
 
 
-def _convolution_forward(images: Images, kernel: Kernel) -> tuple[Images, tuple[Images, Kernel]]:
-    return _convolution(images, kernel), (images, kernel)
+def plain_convolution(images: Images, kernel: Kernel, bias: Bias, rectify: bool) -> Result:
+    """``convolution`` in XLA's own terms, which any program can hold."""
+    seen = jax.nn.relu(images) if rectify else images
+    return jax.lax.conv_general_dilated(seen, kernel, (1, 1), "SAME", dimension_numbers=LAYOUT) + bias
 
 
-def _convolution_backward(residuals: tuple[Images, Kernel], cotangent: Images) -> tuple[Images, Kernel]:
-    images, kernel = residuals
-    turned = kernel[::-1, ::-1].swapaxes(2, 3)  # the gradient by the images is a convolution with this
-    return _convolution(cotangent, turned), _kernel_gradient(images, kernel, cotangent)
+def max_pool(images: Images) -> Pooled:
+    """3 x 3 max-pool with stride 2 and SAME padding."""
+    return _max_pool(images)
 
 
-convolution.defvjp(_convolution_forward, _convolution_backward)
+def plain_max_pool(images: Images) -> Pooled:
+    """``max_pool`` in XLA's own terms, as elementwise maxima of strided slices: faster than XLA's windows.
 
-
-def flax_convolution(
-    images: Images, kernel: Kernel, strides: Sequence[int], padding: Any, **options: Any
-) -> Float32[Array, "N H W D"]:
-    """``convolution`` with the signature that ``flax.linen.Conv`` calls; for its defaults only.
-
-    Raises:
-        ValueError: for another window, stride or padding.
+    Where pixels tie they share the gradient; ``max_pool`` on a CPU and flax give it to the first.
     """
-    if kernel.shape[:2] != WINDOW or tuple(strides) != (1, 1) or padding != "SAME":
-        raise ValueError(f"a {kernel.shape[:2]} window, stride {strides}, padding {padding}: not 3 x 3, stride 1, SAME")
-    return checkpoint_name(convolution(images, kernel), CONVOLVED)
-
-
-def _convolution(images: Images, kernel: Kernel) -> Float32[Array, "N H W D"]:
-    narrow = max(kernel.shape[2:]) <= NARROW
-    if narrow and images.shape[2] % 2 == 0:
-        return jax.lax.platform_dependent(images, kernel, cpu=_column_pairs, default=_plain)
-    return _plain(images, kernel)
-
-
-def _plain(images: Images, kernel: Kernel) -> Float32[Array, "N H W D"]:
-    return jax.lax.conv_general_dilated(images, kernel, (1, 1), "SAME", dimension_numbers=LAYOUT)
-
-
-def _column_pairs(images: Images, kernel: Kernel) -> Float32[Array, "N H W D"]:
-    """The same for an even width: one 3 x 4 window gives two neighbouring columns, as twice the channels.
-
-    A third more products, on a path that is more than a third faster; it wants channels in fours.
-    """
-    num_images, height, width, num_channels = images.shape
-    if more := -num_channels % 4:
-        images = jnp.pad(images, ((0, 0), (0, 0), (0, 0), (0, more)))
-        kernel = jnp.pad(kernel, ((0, 0), (0, 0), (0, more), (0, 0)))
-    missing = jnp.zeros_like(kernel[:, :1])
-    left, right = jnp.concatenate([kernel, missing], axis=1), jnp.concatenate([missing, kernel], axis=1)
-    pair = jnp.concatenate([left, right], axis=-1)
-    columns = jax.lax.conv_general_dilated(images, pair, (1, 2), ((1, 1), (1, 1)), dimension_numbers=LAYOUT)
-    return columns.reshape((num_images, height, width, kernel.shape[-1]))
-
-
-def _kernel_gradient(images: Images, kernel: Kernel, cotangent: Images) -> Kernel:
-    _, height, width, num_in = images.shape
-    small = num_in > NARROW and height * width < LEAST_STACKED_PIXELS
-    if small or num_in < FEWEST_STACKED:
-        return _plain_kernel_gradient(images, kernel, cotangent)
-    ways = {"cpu": _stacked_kernel_gradient, "default": _plain_kernel_gradient}
-    return jax.lax.platform_dependent(images, kernel, cotangent, **ways)
-
-
-def _plain_kernel_gradient(images: Images, kernel: Kernel, cotangent: Images) -> Kernel:
-    _, by_kernel = jax.vjp(lambda kernel: _plain(images, kernel), kernel)
-    return by_kernel(cotangent)[0]
-
-
-def _stacked_kernel_gradient(images: Images, kernel: Kernel, cotangent: Images) -> Kernel:
-    """The same as one matrix product, (3 C, pixels) by (pixels, 3 D), over a few images at a time.
-
-    Of the nine shifts of the images against the cotangent, the three along the columns are stacked as channels of the
-    images and the three along the rows as channels of the cotangent.
-    """
-    num_images, height, width, num_in = images.shape
-    num_out = cotangent.shape[-1]
-    block = largest_divisor(num_images, STACKED_PIXELS // (height * width))
-
-    def add(total: Array, piece: tuple[Images, Images]) -> tuple[Array, None]:
-        image, change = piece
-        image = jnp.pad(image, ((0, 0), (1, 1), (1, 1), (0, 0)))
-        change = jnp.pad(change, ((0, 0), (2, 2), (0, 0), (0, 0)))
-        image, change = jax.lax.optimization_barrier((image, change))  # fused into what follows, padding is slow
-        columns = jnp.concatenate([image[:, :, j : j + width] for j in range(3)], axis=-1)
-        rows = jnp.concatenate([change[:, 2 - i : height + 4 - i] for i in range(3)], axis=-1)
-        columns, rows = columns.reshape(-1, 3 * num_in), rows.reshape(-1, 3 * num_out)
-        return total + columns.T @ rows, None
-
-    pieces = images.reshape(-1, block, *images.shape[1:]), cotangent.reshape(-1, block, *cotangent.shape[1:])
-    total, _ = jax.lax.scan(add, jnp.zeros((3 * num_in, 3 * num_out)), pieces)
-    return total.reshape(3, num_in, 3, num_out).transpose(2, 0, 1, 3)
+    return _pool_axis(_pool_axis(images, axis=2), axis=1)
 
 
 def largest_divisor(number: int, most: int) -> int:
@@ -127,17 +60,94 @@ def largest_divisor(number: int, most: int) -> int:
     return max(n for n in range(1, number + 1) if number % n == 0 and n <= max(1, most))
 
 
-def max_pool(images: Images) -> Float32[Array, "N H2 W2 C"]:
-    """3 x 3 max-pool with stride 2 and SAME padding, as elementwise maxima of strided slices.
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
+def _convolution(images: Images, kernel: Kernel, bias: Bias, rectify: bool) -> Result:
+    return _convolve(images, kernel, bias, rectify)
 
-    Equal to ``flax.linen.max_pool``; its gradient is faster on a CPU, and shared where pixels tie.
-    """
-    return _pool_axis(_pool_axis(images, axis=2), axis=1)
+
+def _convolution_forward(
+    images: Images, kernel: Kernel, bias: Bias, rectify: bool
+) -> tuple[Result, tuple[Images, Kernel]]:
+    return _convolve(images, kernel, bias, rectify), (images, kernel)
+
+
+def _convolution_backward(
+    rectify: bool, residuals: tuple[Images, Kernel], cotangent: Result
+) -> tuple[Images, Kernel, Bias]:
+    images, kernel = residuals
+    turned = kernel[::-1, ::-1].swapaxes(2, 3)  # the gradient by the images is a convolution with this
+    by_seen = _convolve(cotangent, turned, jnp.zeros(kernel.shape[2]), False)
+    by_images = jnp.where(images > 0, by_seen, 0.0) if rectify else by_seen
+    return by_images, _kernel_gradient(images, cotangent, rectify), jnp.sum(cotangent, axis=(0, 1, 2))
+
+
+_convolution.defvjp(_convolution_forward, _convolution_backward)
+
+
+def _convolve(images: Images, kernel: Kernel, bias: Bias, rectify: bool) -> Result:
+    def native(images: Images, kernel: Kernel, bias: Bias) -> Result:
+        kernel, bias = _fill_up(kernel), _fill_up(bias)
+        result = _call("CONVOLVE", (*images.shape[:3], len(bias)), images, kernel, bias, _floor(rectify))
+        return result[..., :num_outputs]
+
+    num_outputs = kernel.shape[3]
+    plain = functools.partial(plain_convolution, rectify=rectify)
+    return _on_cpu(native, plain)(images, kernel, bias)
+
+
+def _kernel_gradient(images: Images, cotangent: Result, rectify: bool) -> Kernel:
+    def native(images: Images, cotangent: Result) -> Kernel:
+        cotangent = _fill_up(cotangent)
+        shape = (*WINDOW, images.shape[3], cotangent.shape[3])
+        return _call("CORRELATE", shape, images, cotangent, _floor(rectify))[..., :num_outputs]
+
+    def plain(images: Images, cotangent: Result) -> Kernel:
+        anywhere = jnp.zeros((*WINDOW, images.shape[3], num_outputs))  # the gradient is the same at every kernel
+        of_kernel = functools.partial(plain_convolution, images, bias=jnp.zeros(num_outputs), rectify=rectify)
+        return jax.vjp(of_kernel, anywhere)[1](cotangent)[0]
+
+    num_outputs = cotangent.shape[3]
+    return _on_cpu(native, plain)(images, cotangent)
+
+
+@jax.custom_vjp
+def _max_pool(images: Images) -> Pooled:
+    return _pool(images)
+
+
+def _pool_forward(images: Images) -> tuple[Pooled, tuple[Images, Pooled]]:
+    pooled = _pool(images)
+    return pooled, (images, pooled)
+
+
+def _pool_backward(residuals: tuple[Images, Pooled], cotangent: Pooled) -> tuple[Images]:
+    def native(images: Images, pooled: Pooled, cotangent: Pooled) -> Images:
+        images, pooled, cotangent = _fill_up(images), _fill_up(pooled), _fill_up(cotangent)
+        return _call("UNPOOL", images.shape, images, pooled, cotangent)[..., :num_channels]
+
+    def plain(images: Images, pooled: Pooled, cotangent: Pooled) -> Images:
+        return jax.vjp(plain_max_pool, images)[1](cotangent)[0]
+
+    num_channels = cotangent.shape[3]
+    return (_on_cpu(native, plain)(*residuals, cotangent),)
+
+
+_max_pool.defvjp(_pool_forward, _pool_backward)
+
+
+def _pool(images: Images) -> Pooled:
+    def native(images: Images) -> Pooled:
+        images = _fill_up(images)
+        num_images, height, width, _ = images.shape
+        return _call("POOL", (num_images, _half(height), _half(width), images.shape[3]), images)[..., :num_channels]
+
+    num_channels = images.shape[3]
+    return _on_cpu(native, plain_max_pool)(images)
 
 
 def _pool_axis(images: Images, axis: int) -> Float32[Array, "N H2 W2 C"]:
     size = images.shape[axis]
-    last = POOL_STRIDE * ((size - 1) // POOL_STRIDE)  # where the last window starts
+    last = POOL_STRIDE * (_half(size) - 1)  # where the last window starts
     padding = max(last + POOL_WINDOW - size, 0)
     widths = [(0, 0)] * images.ndim
     widths[axis] = (padding // 2, padding - padding // 2)
@@ -145,3 +155,35 @@ def _pool_axis(images: Images, axis: int) -> Float32[Array, "N H2 W2 C"]:
     shifts = range(POOL_WINDOW)
     slices = [jax.lax.slice_in_dim(padded, k, k + last + 1, POOL_STRIDE, axis) for k in shifts]
     return jnp.maximum(jnp.maximum(slices[0], slices[1]), slices[2])
+
+
+def _half(size: int) -> int:
+    """Rounded up: what pooling leaves."""
+    return -(-size // POOL_STRIDE)
+
+
+def _on_cpu(native: Callable[..., Array], plain: Callable[..., Array]) -> Callable[..., Array]:
+    """``native`` where a program is made for a CPU, else ``plain``."""
+    if kernels is None:
+        return plain
+    return lambda *arrays: jax.lax.platform_dependent(*arrays, cpu=native, default=plain)
+
+
+def _call(name: str, shape: tuple[int, ...], *arrays: Float32[Array, "..."]) -> Float32[Array, "..."]:
+    """One of kernels.py."""
+    assert kernels is not None
+    kernels.register()
+    result = jax.ShapeDtypeStruct(shape, jnp.float32)
+    return jax.ffi.ffi_call(getattr(kernels, name), result, vmap_method="sequential")(*arrays)
+
+
+def _fill_up(array: Float32[Array, "... D"]) -> Float32[Array, "... E"]:
+    """With as many channels more as the kernels ask for."""
+    assert kernels is not None
+    more = -array.shape[-1] % kernels.OUTPUTS
+    return jnp.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, more)]) if more else array
+
+
+def _floor(rectify: bool) -> Float32[Array, ""]:
+    """What nothing that the kernels see is below."""
+    return jnp.asarray(0.0 if rectify else -jnp.inf, jnp.float32)

@@ -5,6 +5,7 @@ runs over time.
 Networks know nothing of sampling (distributions.py) nor of learning (ppo.py).
 """
 
+import dataclasses
 import functools
 import math
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float32, PRNGKeyArray, Shaped, UInt8, UInt32
 
-from segvisrl_jax.agent.convolution import WINDOW, flax_convolution, max_pool
+from segvisrl_jax.agent.convolution import WINDOW, convolution, max_pool, plain_convolution, plain_max_pool
 from segvisrl_jax.agent.memory import Carry, ResettableLSTM
 from segvisrl_jax.config import ARCH_OBSERVATION, IMAGE_OBSERVATIONS, Arch, NetworkConfig, require
 
@@ -57,16 +58,35 @@ def has_convolutions(arch: Arch) -> bool:
     return ARCH_OBSERVATION[arch] in IMAGE_OBSERVATIONS
 
 
+class Conv(nn.Module):
+    """3 x 3 convolution of the images, or of what relu leaves of them; parameters as those of ``flax.linen.Conv``."""
+
+    channels: int
+    gain: float
+    rectify: bool
+    portable: bool  # see ActorCritic
+
+    @nn.compact
+    def __call__(self, images: Float32[Array, "N H W C"]) -> Float32[Array, "N H W D"]:
+        """D = ``channels``."""
+        start = nn.initializers.orthogonal(self.gain)
+        kernel = self.param("kernel", start, (*WINDOW, images.shape[-1], self.channels))
+        bias = self.param("bias", nn.initializers.zeros, (self.channels,))
+        convolve = plain_convolution if self.portable else convolution
+        return convolve(images, kernel, bias, self.rectify)
+
+
 class ResidualBlock(nn.Module):
     """relu, convolution, relu, convolution, added to the input."""
 
     channels: int
+    portable: bool
 
     @nn.compact
     def __call__(self, images: Float32[Array, "N H W C"]) -> Float32[Array, "N H W C"]:
         """Same shape out as in."""
-        change = _convolution(self.channels, RESIDUAL_GAIN)(nn.relu(images))
-        return images + _convolution(self.channels, RESIDUAL_GAIN)(nn.relu(change))
+        change = Conv(self.channels, RESIDUAL_GAIN, True, self.portable)(images)
+        return images + Conv(self.channels, RESIDUAL_GAIN, True, self.portable)(change)
 
 
 class Body(nn.Module):
@@ -95,22 +115,24 @@ class ImpalaCNN(Body):
     channels: tuple[int, ...]
     blocks_per_stage: int
     feature_size: int
+    portable: bool = False
 
     def setup(self) -> None:
         """Builds the layers, named as flax would number them."""
         blocks = range(self.blocks_per_stage)
         for stage, channels in enumerate(self.channels):
-            setattr(self, f"Conv_{stage}", _convolution(channels))
+            setattr(self, f"Conv_{stage}", Conv(channels, HIDDEN_GAIN, False, self.portable))
             for block in blocks:
-                setattr(self, f"ResidualBlock_{stage * len(blocks) + block}", ResidualBlock(channels))
+                setattr(self, f"ResidualBlock_{stage * len(blocks) + block}", ResidualBlock(channels, self.portable))
         self.Dense_0 = _dense(self.feature_size)
 
     def maps(self, images: UInt8[Array, "*B H W C"]) -> Float32[Array, "*B M"]:
         """What the convolutions make of every image; the leading axes are flattened for them."""
         batch_shape = images.shape[:-3]
         maps = images.reshape((-1, *images.shape[-3:])).astype(jnp.float32) / PIXEL_MAX
+        pool = plain_max_pool if self.portable else max_pool
         for stage in range(len(self.channels)):
-            maps = max_pool(getattr(self, f"Conv_{stage}")(maps))
+            maps = pool(getattr(self, f"Conv_{stage}")(maps))
             for block in range(self.blocks_per_stage):
                 maps = getattr(self, f"ResidualBlock_{stage * self.blocks_per_stage + block}")(maps)
         return nn.relu(maps).reshape((*batch_shape, -1))
@@ -138,11 +160,12 @@ class ActorCritic(nn.Module):
 
     arch: Arch
     config: NetworkConfig
+    portable: bool = False  # made of XLA's own operations, which run wherever XLA does, and not of our kernels
 
     def setup(self) -> None:
         """Builds the body, the memory where the architecture has one, and the heads."""
         config = self.config
-        self.body = _make_body(self.arch, config)
+        self.body = _make_body(self.arch, config, self.portable)
         if has_memory(self.arch):
             self.memory = ResettableLSTM(config.lstm_size)
         self.policy_head = _dense(ACTION_SIZE, POLICY_GAIN, _initial_bias(config))
@@ -256,6 +279,11 @@ class Network:
         return self.module.initial_carry(batch_shape)
 
     @property
+    def portable(self) -> "Network":
+        """The same network, made of XLA's own operations."""
+        return dataclasses.replace(self, module=self.module.clone(portable=True))
+
+    @property
     def has_memory(self) -> bool:
         """Whether the network carries an LSTM."""
         return has_memory(self.module.arch)
@@ -285,9 +313,9 @@ def make_network(arch: str, config: NetworkConfig, observation_shape: tuple[int,
     return Network(ActorCritic(cast(Arch, arch), config), tuple(observation_shape))
 
 
-def _make_body(arch: Arch, config: NetworkConfig) -> Body:
+def _make_body(arch: Arch, config: NetworkConfig, portable: bool) -> Body:
     if has_convolutions(arch):
-        return ImpalaCNN(config.channels, config.blocks_per_stage, config.feature_size)
+        return ImpalaCNN(config.channels, config.blocks_per_stage, config.feature_size, portable)
     return MLP(config.mlp_sizes)
 
 
@@ -300,8 +328,3 @@ def _initial_bias(config: NetworkConfig) -> nn.initializers.Initializer:
 
 def _dense(size: int, gain: float = HIDDEN_GAIN, bias: nn.initializers.Initializer = nn.initializers.zeros) -> nn.Dense:
     return nn.Dense(size, kernel_init=nn.initializers.orthogonal(gain), bias_init=bias)
-
-
-def _convolution(channels: int, gain: float = HIDDEN_GAIN) -> nn.Conv:
-    start = nn.initializers.orthogonal(gain)
-    return nn.Conv(channels, WINDOW, kernel_init=start, conv_general_dilated=flax_convolution)

@@ -4,6 +4,7 @@ The step is (observation, carry, is_first) -> (action, carry), with the paramete
 ``jax.export.deserialize(...).call`` runs it without this package; JAX promises to read it for six months at least.
 """
 
+import dataclasses
 import io
 import json
 import zipfile
@@ -22,6 +23,7 @@ PLATFORMS = ("cpu", "cuda", "tpu")
 
 def build(step: PolicyStep) -> bytes:
     """The step, lowered for every platform and serialized."""
+    step = dataclasses.replace(step, network=step.network.portable)
     lowered = export.export(jax.jit(exact(step)), platforms=PLATFORMS)(step.observation, step.carry, step.is_first)
     return bytes(lowered.serialize())
 

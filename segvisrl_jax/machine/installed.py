@@ -25,6 +25,7 @@ OPTIONAL = {  # package -> the extra that brings it
     "wandb": "wandb",
     "mlflow-skinny": "mlflow",
 }
+KERNELS = "llvmlite"  # training runs without it, where someone left it out
 GL_VARIABLE = "MUJOCO_GL"  # MuJoCo loads what it names when it is imported
 REINSTALL = "pip install --upgrade segvisrl_jax brings versions that fit"
 
@@ -41,6 +42,7 @@ def look(version_of: Callable[[str], str] = version) -> Iterator[Finding]:
     for name in NEEDED:
         yield _needed(name, found[name], wanted.get(name))
     yield from _pair(found["mujoco"], found["mujoco-mjx"])
+    yield _kernels(_version_or_none(KERNELS, version_of))
     for name, extra in OPTIONAL.items():
         missing = f"not installed; pip install '{PACKAGE}[{extra}]' brings it"
         yield Finding(SECTION, name, found[name] or missing, "ok" if found[name] else "note")
@@ -87,6 +89,13 @@ def _pair(mujoco: str | None, mjx: str | None) -> Iterator[Finding]:
     if mujoco and mjx and mujoco != mjx:
         remedy = f"Install both in one version: pip install mujoco=={mjx} mujoco-mjx=={mjx}."
         yield Finding(SECTION, "mujoco, mujoco-mjx", f"{mujoco} and {mjx} differ", "problem", remedy)
+
+
+def _kernels(found: str | None) -> Finding:
+    if found:
+        return Finding(SECTION, KERNELS, found)
+    remedy = f"Install what compiles convolutions for a CPU: pip install {KERNELS}."
+    return Finding(SECTION, KERNELS, "not installed: a CPU learns from images at half the speed", "problem", remedy)
 
 
 def _importable(module: str) -> Finding:

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from segvisrl_jax.agent.convolution import flax_convolution, max_pool
 from segvisrl_jax.agent.memory import ResettableLSTM
 from segvisrl_jax.agent.networks import ImpalaCNN, Network, make_network
 from segvisrl_jax.config import ConfigError, NetworkConfig
@@ -48,50 +47,6 @@ def resets(seed: int = 1) -> jax.Array:
     drawn = np.random.default_rng(seed).random((T, B)) < 0.25
     assert drawn[1:-1].any()
     return jnp.asarray(drawn, jnp.float32)
-
-
-SIZES = {"even": (6, 8), "odd rows": (7, 12), "odd columns": (4, 9), "one image at a time": (54, 97)}
-CHANNELS = {"image": (3, 16), "narrow": (16, 16), "wider": (16, 32), "wide": (32, 32)}
-
-
-@pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
-@pytest.mark.parametrize("channels", CHANNELS.values(), ids=CHANNELS)
-def test_convolution_is_that_of_flax_in_value_and_gradient(size: tuple[int, int], channels: tuple[int, int]) -> None:
-    rng = np.random.default_rng(0)
-    images = jnp.asarray(rng.normal(size=(2, *size, channels[0])), jnp.float32)
-    weights = jnp.asarray(rng.normal(size=(2, *size, channels[1])), jnp.float32)
-    theirs = nn.Conv(channels[1], (3, 3))
-    ours = theirs.clone(conv_general_dilated=flax_convolution)
-    params = theirs.init(jax.random.key(0), images)
-
-    def total(layer, params, images):
-        return jnp.sum(jnp.square(layer.apply(params, images)) * weights)
-
-    results = [
-        jax.jit(jax.value_and_grad(functools.partial(total, layer), argnums=(0, 1)))(params, images)
-        for layer in (ours, theirs)
-    ]
-    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-3), *results)
-
-
-@pytest.mark.parametrize("options", [{"strides": 2}, {"padding": "VALID"}, {"kernel_size": (5, 5)}])
-def test_convolution_refuses_what_it_does_not_compute(options: dict) -> None:
-    layer = nn.Conv(4, **({"kernel_size": (3, 3)} | options), conv_general_dilated=flax_convolution)
-    with pytest.raises(ValueError, match="not 3 x 3, stride 1, SAME"):
-        layer.init(jax.random.key(0), jnp.zeros((1, 8, 8, 3)))
-
-
-@pytest.mark.parametrize("size", [(8, 12), (9, 13), (27, 48), (1, 2), (1, 1)])
-def test_max_pool_is_that_of_flax(size: tuple[int, int]) -> None:
-    images = jnp.asarray(np.random.default_rng(0).normal(size=(2, *size, 3)), jnp.float32)
-
-    def flax_pool(images: jax.Array) -> jax.Array:
-        return nn.max_pool(images, (3, 3), strides=(2, 2), padding="SAME")
-
-    np.testing.assert_array_equal(max_pool(images), flax_pool(images))
-    weights = jnp.asarray(np.random.default_rng(1).normal(size=flax_pool(images).shape))
-    ours, theirs = (jax.grad(lambda x, pool=pool: jnp.sum(pool(x) * weights))(images) for pool in (max_pool, flax_pool))
-    np.testing.assert_allclose(ours, theirs, rtol=1e-5)
 
 
 def test_cnn_reads_pixels_as_shares_of_255() -> None:

@@ -9,6 +9,7 @@ been compiled. Prints a table; exit code 1 where memory grew by more than one pe
 import argparse
 import contextlib
 import os
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -24,7 +25,8 @@ DECISIONS_AT_ONCE = 64
 FRAMES_A_RENDERER = 100  # after which it is closed and another one opened
 MOST_GROWTH = 0.01
 READ_EVERY_S = 5.0  # of a training
-UPDATES_A_CHECKPOINT = 8
+TRAINING = "--arch cnn_lstm --preset cpu --steps 1000000000"
+STOPPED = 130  # exit code of a training that was told to stop
 
 
 @dataclass(frozen=True)
@@ -106,29 +108,33 @@ def draw(frames: int) -> Soaked:
     return Soaked("gl", f"{rounds * FRAMES_A_RENDERER:,} frames, {rounds} renderers", None, memory)
 
 
-def train(hours: float) -> Soaked:
+def train(hours: float, options: str = TRAINING, runs_dir: str | None = None) -> Soaked:
     """A training in a process of its own, stopped in order when its time is over."""
     with tempfile.TemporaryDirectory() as folder:
-        words = ["--arch", "cnn_lstm", "--preset", "cpu", "--steps", str(10**9), "--runs-dir", folder, "--run", "soak"]
-        command = [sys.executable, "-m", "segvisrl_jax.cli", "train", *words]
+        run = Path(runs_dir or folder) / "soak"
+        words = ["--resume"] if (run / "config.json").exists() else shlex.split(options)
+        words += ["--runs-dir", str(run.parent), "--run", run.name]
         memory: list[float] = []
-        began = time.monotonic()
-        numbers = Path(folder) / "soak" / "metrics.jsonl"
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-            while process.poll() is None and (time.monotonic() - began < 3600 * hours or not has_lines(numbers)):
+        before, began = count_lines(run / "metrics.jsonl"), time.monotonic()
+        with subprocess.Popen(
+            [sys.executable, "-m", "segvisrl_jax.cli", "train", *words], stdout=subprocess.DEVNULL
+        ) as process:
+            while process.poll() is None and (
+                time.monotonic() - began < 3600 * hours or count_lines(run / "metrics.jsonl") == before
+            ):
                 time.sleep(READ_EVERY_S)
                 memory.append(resident_mib(process.pid))
             process.terminate()
             code = process.wait()
-        if code != 130:
+        if code not in (0, STOPPED):
             raise RuntimeError(f"the training ended with exit code {code}")
-        lines = len(numbers.read_text().splitlines())
+        lines = count_lines(run / "metrics.jsonl") - before
     return Soaked("train", f"{hours:g} h, {lines} updates", None, memory)
 
 
-def has_lines(file: Path) -> bool:
-    """Whether an update has been written down."""
-    return file.exists() and file.stat().st_size > 0
+def count_lines(file: Path) -> int:
+    """Updates that have been written down."""
+    return len(file.read_text().splitlines()) if file.exists() else 0
 
 
 def counted(rounds: int, name: str) -> Iterator[int]:
@@ -146,12 +152,14 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--mjx-decisions", type=int, default=100_000)
     parser.add_argument("--frames", type=int, default=2_000)
     parser.add_argument("--hours", type=float, default=3.0)
+    parser.add_argument("--options", default=TRAINING, help=f"of the training ({TRAINING})")
+    parser.add_argument("--runs-dir", help="keeps the training there, as run 'soak', or goes on with it")
     asked = parser.parse_args(words)
     work: dict[str, Callable[[], Soaked]] = {
         "native": lambda: drive("native", asked.native_decisions),
         "mjx": lambda: drive("mjx", asked.mjx_decisions),
         "gl": lambda: draw(asked.frames),
-        "train": lambda: train(asked.hours),
+        "train": lambda: train(asked.hours, asked.options, asked.runs_dir),
     }
     soaked = [work[part]() for part in asked.parts]
     print("\n| part | done | unstable | memory [MiB] | growth |\n|---|---|---|---|---|")

@@ -16,9 +16,10 @@ import mujoco.rollout
 import numpy as np
 from jaxtyping import Array, Float, Float32
 
+from segvisrl_jax import ffi
 from segvisrl_jax.config import ConfigError, EnvConfig
 from segvisrl_jax.env.model import build_physics_model
-from segvisrl_jax.env.physics import engine, ffi
+from segvisrl_jax.env.physics import engine
 from segvisrl_jax.types import PhysicsState
 
 

@@ -20,24 +20,24 @@ F32 = 11  # XLA_FFI_DataType_F32
 BatchFunction = Callable[[list[np.ndarray], list[np.ndarray]], None]
 
 
-class _Extension(Structure):
+class Extension(Structure):
     pass
 
 
-_Extension._fields_ = [("struct_size", c_size_t), ("type", c_int), ("next", POINTER(_Extension))]
-_HEAD: list[Any] = [("struct_size", c_size_t), ("extension_start", POINTER(_Extension))]
+Extension._fields_ = [("struct_size", c_size_t), ("type", c_int), ("next", POINTER(Extension))]
+_HEAD: list[Any] = [("struct_size", c_size_t), ("extension_start", POINTER(Extension))]
 
 
-class _Version(Structure):
+class Version(Structure):
     _fields_ = [*_HEAD, ("major", c_int), ("minor", c_int)]
 
 
-class _Metadata(Structure):
-    _fields_ = [("struct_size", c_size_t), ("version", _Version), ("traits", c_uint32), ("state_type", c_int64)]
+class Metadata(Structure):
+    _fields_ = [("struct_size", c_size_t), ("version", Version), ("traits", c_uint32), ("state_type", c_int64)]
 
 
-class _MetadataExtension(Structure):
-    _fields_ = [("base", _Extension), ("metadata", POINTER(_Metadata))]
+class MetadataExtension(Structure):
+    _fields_ = [("base", Extension), ("metadata", POINTER(Metadata))]
 
 
 class _ErrorArgs(Structure):
@@ -47,32 +47,32 @@ class _ErrorArgs(Structure):
 class _Api(Structure):
     _fields_ = [
         *_HEAD,
-        ("version", _Version),
+        ("version", Version),
         ("internal", c_void_p),
         ("create_error", ctypes.CFUNCTYPE(c_void_p, POINTER(_ErrorArgs))),
     ]
 
 
-class _Buffer(Structure):
+class Buffer(Structure):
     _fields_ = [*_HEAD, ("dtype", c_int), ("data", c_void_p), ("rank", c_int64), ("dims", POINTER(c_int64))]
 
 
-class _Buffers(Structure):
-    _fields_ = [*_HEAD, ("size", c_int64), ("types", POINTER(c_int)), ("buffers", POINTER(POINTER(_Buffer)))]
+class Buffers(Structure):
+    _fields_ = [*_HEAD, ("size", c_int64), ("types", POINTER(c_int)), ("buffers", POINTER(POINTER(Buffer)))]
 
 
-class _CallFrame(Structure):
+class CallFrame(Structure):
     _fields_ = [
         *_HEAD,
         ("api", POINTER(_Api)),
         ("context", c_void_p),
         ("stage", c_int),
-        ("arguments", _Buffers),
-        ("results", _Buffers),
+        ("arguments", Buffers),
+        ("results", Buffers),
     ]
 
 
-_HANDLER = ctypes.CFUNCTYPE(c_void_p, POINTER(_CallFrame))
+_HANDLER = ctypes.CFUNCTYPE(c_void_p, POINTER(CallFrame))
 _registered: dict[str, object] = {}  # by target; XLA keeps their addresses as long as the process lives
 
 
@@ -87,7 +87,7 @@ def register(target: str, function: BatchFunction) -> None:
     if target in _registered:
         return
 
-    def handle(frame_pointer: "ctypes._Pointer[_CallFrame]") -> int | None:
+    def handle(frame_pointer: "ctypes._Pointer[CallFrame]") -> int | None:
         frame = frame_pointer.contents
         if _answered_metadata(frame):
             return None
@@ -103,21 +103,21 @@ def register(target: str, function: BatchFunction) -> None:
     jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(address), platform="cpu")
 
 
-def _answered_metadata(frame: _CallFrame) -> bool:
+def _answered_metadata(frame: CallFrame) -> bool:
     """Says which version of the interface this is, where XLA asks; it does so once, when the target is registered."""
     extension = frame.extension_start
     if not extension or extension.contents.type != METADATA_EXTENSION:
         return False
-    metadata = ctypes.cast(extension, POINTER(_MetadataExtension)).contents.metadata.contents
+    metadata = ctypes.cast(extension, POINTER(MetadataExtension)).contents.metadata.contents
     metadata.version.major, metadata.version.minor, metadata.traits = API_MAJOR, API_MINOR, 0
     return True
 
 
-def _arrays(buffers: _Buffers) -> list[np.ndarray]:
+def _arrays(buffers: Buffers) -> list[np.ndarray]:
     return [_array(buffers.buffers[i].contents) for i in range(buffers.size)]
 
 
-def _array(buffer: _Buffer) -> np.ndarray:
+def _array(buffer: Buffer) -> np.ndarray:
     """XLA's memory as an array: nothing is copied."""
     if buffer.dtype != F32:
         raise TypeError(f"data type {buffer.dtype}: should be float32")
@@ -127,6 +127,6 @@ def _array(buffer: _Buffer) -> np.ndarray:
     return np.ctypeslib.as_array(ctypes.cast(buffer.data, POINTER(c_float)), shape)
 
 
-def _error(frame: _CallFrame, message: str) -> int | None:
+def _error(frame: CallFrame, message: str) -> int | None:
     arguments = _ErrorArgs(ctypes.sizeof(_ErrorArgs), None, message.encode(), INTERNAL_ERROR)
     return frame.api.contents.create_error(ctypes.byref(arguments))

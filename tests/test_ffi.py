@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from segvisrl_jax.env.physics import ffi
+from segvisrl_jax import ffi
 
 
 def twice_plus_sum(arguments, results):
