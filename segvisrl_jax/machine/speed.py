@@ -76,7 +76,7 @@ def policy_rows(config: TrainConfig, repeats: int, limit_flop_per_s: float) -> I
         observation = jnp.zeros((num_envs, *network.observation_shape), network.observation_dtype)
         given = (params, network.initial_carry((num_envs,)), observation, jnp.zeros(num_envs))
         compile_s, seconds = time_calls(functools.partial(step, *given), repeats)
-        flop = flop_of(network.step, *given)
+        flop = flop_of(network.portable.step, *given)
         row = {"name": _named(config), "batch": num_envs, "decisions_per_s": num_envs / seconds}
         yield row | _share(flop / num_envs, num_envs / seconds, limit_flop_per_s) | {"compile_s": compile_s}
 
@@ -93,8 +93,9 @@ def update_rows(config: TrainConfig, repeats: int, limit_flop_per_s: float) -> I
     _, trajectory, last_value, _ = trainer.act(state)
     learner, network, params = trainer.learner, trainer.network, state.learner.params
     one = jnp.zeros((1, *network.observation_shape), network.observation_dtype)
-    maps_flop = flop_of(network.maps, params, one)
-    all_flop = flop_of(network.step, params, network.initial_carry((1,)), one, jnp.zeros(1))
+    counted = network.portable  # XLA does not know how much work kernels do
+    maps_flop = flop_of(counted.maps, params, one)
+    all_flop = flop_of(counted.step, params, network.initial_carry((1,)), one, jnp.zeros(1))
     update = functools.partial(learner.update, state.learner, trajectory, last_value, jax.random.key(0))
     compile_s, seconds = time_calls(update, repeats)
     rate = config.ppo.decisions_per_update * config.ppo.num_epochs / seconds
