@@ -1,10 +1,9 @@
 """Proximal policy optimisation (Schulman et al., 2017) of a recurrent policy: epochs and steps.
 
-One ``Learner``, two ways to run it, one result. ``fused``: the whole update is one compiled
-program, for accelerators. ``host``: Python drives the minibatches, since XLA on a CPU runs convolutions inside a loop
-many times slower than outside it. Every core takes a few images at a time through the convolutions, forward and later
-backward, which fit its cache and are faster than all cores at one convolution; the memory and the loss between
-the two take whole environments. Gradients are added in a fixed order.
+One ``Learner``, two ways to run it, one result. ``fused``: the whole update is one compiled program, for accelerators.
+``host``: Python drives the minibatches, since a convolution on a CPU is the work of one core (kernels.py). Every core
+takes a few images at a time, which fit its cache, through the convolutions, forward and later backward; the memory and
+the loss between the two take whole environments. Gradients are added in a fixed order.
 The loss is in loss.py; acting is not here (training/rollout.py).
 """
 

@@ -88,8 +88,8 @@ class Trainer:
     def _train_seeds_together(self) -> None:
         """Has every program do its work for all seeds; what it takes and gives is (K, ...).
 
-        One program for all where the learner is one; else one seed after the other: XLA on a CPU is very slow at
-        convolutions whose kernels differ.
+        One program for all where the learner is one; else one seed after the other: it is Python that drives the
+        learner then, and every core already.
         """
         for name in ("_lay_out", "_split", "_init", "_begin", "_unroll", "_learn"):
             work = getattr(self, name)
