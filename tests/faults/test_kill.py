@@ -24,7 +24,7 @@ def endings(tmp_path_factory):
 def test_killed_runs_end_as_if_never_killed(endings):
     _, ended = endings
     assert all(ending.same for ending in ended)
-    assert sum(len(ending.killed_in) for ending in ended) >= NUM_RUNS
+    assert all(ending.killed_in for ending in ended)
 
 
 @pytest.mark.slow
