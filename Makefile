@@ -82,7 +82,7 @@ bench: $(READY) ## measure physics, rendering and learning on this machine
 	@$(BIN)/segvisrl bench $(ARGS)
 
 test: $(READY) ## the whole suite, on the CPU, in WORKERS processes
-	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
+	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-fast: $(READY) ## the edit loop: everything but the slow tests
 	@JAX_PLATFORMS=cpu $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow" $(ARGS)
