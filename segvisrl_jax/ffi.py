@@ -1,4 +1,4 @@
-"""NumPy functions that a compiled program on the CPU calls by name, through XLA's foreign function interface.
+"""What a compiled program on the CPU calls by name, through XLA's foreign function interface: here NumPy functions.
 
 ``jax.pure_callback`` puts the address of its function into the program, so that JAX cannot keep the program on disk
 for the next process. What is called by name can be kept, and needs no arrays made in between. The structures are those

@@ -76,7 +76,7 @@ def _convolution_backward(
 ) -> tuple[Images, Kernel, Bias]:
     images, kernel = residuals
     turned = kernel[::-1, ::-1].swapaxes(2, 3)  # the gradient by the images is a convolution with this
-    by_seen = _convolve(cotangent, turned, jnp.zeros(kernel.shape[2]), False)
+    by_seen = _convolve(cotangent, turned, jnp.zeros(kernel.shape[2], jnp.float32), False)
     by_images = jnp.where(images > 0, by_seen, 0.0) if rectify else by_seen
     return by_images, _kernel_gradient(images, cotangent, rectify), jnp.sum(cotangent, axis=(0, 1, 2))
 
@@ -170,8 +170,10 @@ def _on_cpu(native: Callable[..., Array], plain: Callable[..., Array]) -> Callab
 
 
 def _call(name: str, shape: tuple[int, ...], *arrays: Float32[Array, "..."]) -> Float32[Array, "..."]:
-    """One of kernels.py."""
+    """One of kernels.py, which read and write memory as float32 whatever it holds."""
     assert kernels is not None
+    if wrong := {str(array.dtype) for array in arrays if array.dtype != jnp.float32}:
+        raise TypeError(f"arrays of {', '.join(sorted(wrong))}: should be float32")
     kernels.register()
     result = jax.ShapeDtypeStruct(shape, jnp.float32)
     return jax.ffi.ffi_call(getattr(kernels, name), result, vmap_method="sequential")(*arrays)

@@ -24,7 +24,6 @@ MULTIPLY_ADD = f"llvm.fmuladd.v{LANES}f32"
 Value = Any  # of LLVM's intermediate representation
 Write = Callable[..., None]  # of the code, and of the arguments' and the result's arrays: writes what is done
 
-
 _engines: list[binding.ExecutionEngine] = []  # machine code lives as long as they do
 
 
@@ -131,11 +130,11 @@ class Code:
         return [self.field(dims, i * ctypes.sizeof(ctypes.c_int64), INT) for i in range(4)]
 
     def vectors(self, start: Value) -> list[Value]:
-        """The numbers of ``OUTPUTS`` channels."""
+        """``VECTORS`` vectors that lie side by side."""
         return [self.builder.load(self.at(start, v * LANES), typ=VECTOR, align=FLOAT_BYTES) for v in range(VECTORS)]
 
     def put_vectors(self, vectors: Sequence[Value], start: Value) -> None:
-        """Writes the numbers of ``OUTPUTS`` channels."""
+        """Writes them side by side."""
         for v, vector in enumerate(vectors):
             self.builder.store(vector, self.at(start, v * LANES), align=FLOAT_BYTES)
 

@@ -70,8 +70,8 @@ class Conv(nn.Module):
     def __call__(self, images: Float32[Array, "N H W C"]) -> Float32[Array, "N H W D"]:
         """D = ``channels``."""
         start = nn.initializers.orthogonal(self.gain)
-        kernel = self.param("kernel", start, (*WINDOW, images.shape[-1], self.channels))
-        bias = self.param("bias", nn.initializers.zeros, (self.channels,))
+        kernel = self.param("kernel", start, (*WINDOW, images.shape[-1], self.channels), jnp.float32)
+        bias = self.param("bias", nn.initializers.zeros, (self.channels,), jnp.float32)
         convolve = plain_convolution if self.portable else convolution
         return convolve(images, kernel, bias, self.rectify)
 

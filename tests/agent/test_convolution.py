@@ -91,6 +91,12 @@ def test_without_llvmlite_xla_does_it(monkeypatch):
     close(value_and_gradients(convolution, True, arrays), value_and_gradients(flax_convolution, True, arrays))
 
 
+def test_numbers_of_another_kind_are_refused():
+    images, kernel, bias, _ = arrays_of((5, 9), (3, 16))
+    with pytest.raises(TypeError, match="arrays of float16: should be float32"):
+        module._call("CONVOLVE", (2, 5, 9, 16), images.astype(jnp.float16), kernel, bias, jnp.zeros(()))
+
+
 def test_what_is_not_a_number_stays_so():
     images, kernel, bias, _ = arrays_of((5, 9), (3, 16))
     images = images.at[0, 2, 4, 1].set(jnp.nan)

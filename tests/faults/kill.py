@@ -76,13 +76,12 @@ def end_somehow(runs: Path, name: str, arch: str, seconds: float, chance: random
                 process.wait()
                 ending.killed_in.append(stage(runs / name, log.read_text()))
                 continue
-        if code == 0 and ending.killed_in:
+        if code != 0:
+            raise RuntimeError(f"{name} ended with exit code {code}:\n{log.read_text()[-3000:]}")
+        if ending.killed_in:
             return ending
-        if code == 0:  # faster than it was expected to be: once more, and sooner
-            shutil.rmtree(runs / name)
-            seconds /= 2
-            continue
-        raise RuntimeError(f"{name} ended with exit code {code}:\n{log.read_text()[-3000:]}")
+        shutil.rmtree(runs / name)  # faster than it was expected to be: once more, and killed sooner
+        seconds /= 2
 
 
 def differences(one: Path, other: Path) -> list[str]:
