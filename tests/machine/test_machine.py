@@ -45,6 +45,13 @@ def test_what_is_missing_stops_training_and_what_is_optional_does_not():
     assert "segvisrl_jax[sb3]" in found["torch"].value
 
 
+def test_without_llvmlite_training_runs_slower():
+    assert by_name(installed.look())["llvmlite"].mark == "ok"
+    missing = by_name(installed.look(versions(llvmlite=None)))["llvmlite"]
+    assert (missing.mark, missing.stops_training) == ("problem", False)
+    assert "pip install llvmlite" in missing.remedy
+
+
 def test_untested_and_unpaired_versions_are_problems():
     found = by_name(installed.look(versions(jax="0.4.30", mujoco_mjx="3.16.0")))
     assert found["jax"].mark == "problem"
