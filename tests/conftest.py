@@ -1,6 +1,8 @@
-"""Settings for the whole suite: CPU only, repeatable property tests."""
+"""Settings for the whole suite: CPU only, repeatable property tests, programs that do not pile up."""
 
+import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -12,8 +14,12 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1]
 os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(2**31))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 
+import jax
 import pytest
 from hypothesis import HealthCheck, settings
+
+MAPS = Path("/proc/self/maps")  # Linux: a line for each piece of this process's memory
+MOST_MAPS = 20_000  # Linux allows 65,530 (vm.max_map_count); beyond, LLVM ends the process while it compiles
 
 settings.register_profile(
     "repeatable",
@@ -54,3 +60,12 @@ def _mujoco_without_a_display(request: pytest.FixtureRequest, monkeypatch: pytes
         from segvisrl_jax.vision.gl_context import open_gl_context
 
         monkeypatch.setattr(gl_context, "GLContext", open_gl_context)
+
+
+@pytest.fixture(autouse=True)
+def _programs_do_not_pile_up() -> Iterator[None]:
+    """Every compiled program keeps some pieces of memory, and a worker compiles thousands of programs."""
+    yield
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST_MAPS:
+        jax.clear_caches()
+        gc.collect()
