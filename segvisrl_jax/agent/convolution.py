@@ -5,7 +5,7 @@ operations, and so does a CPU where llvmlite, which compiles the kernels, is not
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import ModuleType
 
 import jax
@@ -87,7 +87,8 @@ _convolution.defvjp(_convolution_forward, _convolution_backward)
 def _convolve(images: Images, kernel: Kernel, bias: Bias, rectify: bool) -> Result:
     def native(images: Images, kernel: Kernel, bias: Bias) -> Result:
         kernel, bias = _fill_up(kernel), _fill_up(bias)
-        result = _call("CONVOLVE", (*images.shape[:3], len(bias)), images, kernel, bias, _floor(rectify))
+        shapes = (*images.shape[:3], len(bias)), _padded_rows(images)
+        result, _ = _call("CONVOLVE", shapes, images, kernel, bias, _floor(rectify))
         return result[..., :num_outputs]
 
     num_outputs = kernel.shape[3]
@@ -98,8 +99,9 @@ def _convolve(images: Images, kernel: Kernel, bias: Bias, rectify: bool) -> Resu
 def _kernel_gradient(images: Images, cotangent: Result, rectify: bool) -> Kernel:
     def native(images: Images, cotangent: Result) -> Kernel:
         cotangent = _fill_up(cotangent)
-        shape = (*WINDOW, images.shape[3], cotangent.shape[3])
-        return _call("CORRELATE", shape, images, cotangent, _floor(rectify))[..., :num_outputs]
+        shapes = (*WINDOW, images.shape[3], cotangent.shape[3]), _padded_rows(images)
+        gradient, _ = _call("CORRELATE", shapes, images, cotangent, _floor(rectify))
+        return gradient[..., :num_outputs]
 
     def plain(images: Images, cotangent: Result) -> Kernel:
         anywhere = jnp.zeros((*WINDOW, images.shape[3], num_outputs))  # the gradient is the same at every kernel
@@ -123,7 +125,8 @@ def _pool_forward(images: Images) -> tuple[Pooled, tuple[Images, Pooled]]:
 def _pool_backward(residuals: tuple[Images, Pooled], cotangent: Pooled) -> tuple[Images]:
     def native(images: Images, pooled: Pooled, cotangent: Pooled) -> Images:
         images, pooled, cotangent = _fill_up(images), _fill_up(pooled), _fill_up(cotangent)
-        return _call("UNPOOL", images.shape, images, pooled, cotangent)[..., :num_channels]
+        (gradient,) = _call("UNPOOL", (images.shape,), images, pooled, cotangent)
+        return gradient[..., :num_channels]
 
     def plain(images: Images, pooled: Pooled, cotangent: Pooled) -> Images:
         return jax.vjp(plain_max_pool, images)[1](cotangent)[0]
@@ -139,7 +142,8 @@ def _pool(images: Images) -> Pooled:
     def native(images: Images) -> Pooled:
         images = _fill_up(images)
         num_images, height, width, _ = images.shape
-        return _call("POOL", (num_images, _half(height), _half(width), images.shape[3]), images)[..., :num_channels]
+        (pooled,) = _call("POOL", ((num_images, _half(height), _half(width), images.shape[3]),), images)
+        return pooled[..., :num_channels]
 
     num_channels = images.shape[3]
     return _on_cpu(native, plain_max_pool)(images)
@@ -169,14 +173,20 @@ def _on_cpu(native: Callable[..., Array], plain: Callable[..., Array]) -> Callab
     return lambda *arrays: jax.lax.platform_dependent(*arrays, cpu=native, default=plain)
 
 
-def _call(name: str, shape: tuple[int, ...], *arrays: Float32[Array, "..."]) -> Float32[Array, "..."]:
-    """One of kernels.py, which read and write memory as float32 whatever it holds."""
+def _call(name: str, shapes: Sequence[tuple[int, ...]], *arrays: Float32[Array, "..."]) -> list[Float32[Array, "..."]]:
+    """One of kernels.py, which read and write memory as float32 whatever it holds: results of these shapes."""
     assert kernels is not None
     if wrong := {str(array.dtype) for array in arrays if array.dtype != jnp.float32}:
         raise TypeError(f"arrays of {', '.join(sorted(wrong))}: should be float32")
     kernels.register()
-    result = jax.ShapeDtypeStruct(shape, jnp.float32)
-    return jax.ffi.ffi_call(getattr(kernels, name), result, vmap_method="sequential")(*arrays)
+    results = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
+    return list(jax.ffi.ffi_call(getattr(kernels, name), results, vmap_method="sequential")(*arrays))
+
+
+def _padded_rows(images: Images) -> tuple[int, ...]:
+    """The shape of the memory that a kernel needs to look at images; from XLA, which knows how much there is."""
+    _, _, width, num_channels = images.shape
+    return WINDOW[0], width + WINDOW[1] - 1, num_channels
 
 
 def _fill_up(array: Float32[Array, "... D"]) -> Float32[Array, "... E"]:

@@ -26,6 +26,7 @@ from segvisrl_jax.agent.native_code import (
     VECTORS,
     Code,
     Value,
+    Write,
     compile_and_register,
     whole,
 )
@@ -49,7 +50,13 @@ def register() -> None:
 
 @functools.cache
 def _compiled() -> None:
-    compile_and_register({CONVOLVE: (_convolve, 4), CORRELATE: (_correlate, 3), POOL: (_pool, 1), UNPOOL: (_unpool, 3)})
+    functions: dict[str, tuple[Write, int, int]] = {
+        CONVOLVE: (_convolve, 4, 2),
+        CORRELATE: (_correlate, 3, 2),
+        POOL: (_pool, 1, 1),
+        UNPOOL: (_unpool, 3, 1),
+    }
+    compile_and_register(functions)
 
 
 @dataclass
@@ -63,19 +70,22 @@ class _Line:
 
 
 @contextmanager
-def _lines(code: Code, array: Value, floor: Value) -> Iterator[_Line]:
-    """What is written inside is done for every row of images (N, H, W, C), seen as if none were below ``floor``."""
+def _lines(code: Code, array: Value, floor: Value, rows: Value) -> Iterator[_Line]:
+    """What is written inside is done for every row of images (N, H, W, C), seen as if none were below ``floor``.
+
+    ``rows`` (3, W + 2, C) takes the padded rows.
+    """
     builder = code.builder
     images, (num_images, height, width, num_channels) = code.data(array), code.shape(array)
     least = builder.load(code.data(floor), typ=FLOAT)
     row_size = code.product(width, num_channels)
     length = code.product(code.sum(width, PADDING), num_channels)
-    scratch = code.call("malloc", POINTER, code.product(WINDOW, length, FLOAT_BYTES))
-    code.call("memset", POINTER, scratch, INT32(0), code.product(WINDOW, length, FLOAT_BYTES))
+    padded = code.data(rows)
+    code.call("memset", POINTER, padded, INT32(0), code.product(WINDOW, length, FLOAT_BYTES))
 
     def place(y: Value) -> Value:
         """Where the padded row y is: three of them, one after the other, take turns."""
-        return code.at(scratch, code.product(builder.srem(y, whole(WINDOW)), length))
+        return code.at(padded, code.product(builder.srem(y, whole(WINDOW)), length))
 
     with code.loop(0, num_images) as image:
         first = code.product(image.index, height)
@@ -100,15 +110,14 @@ def _lines(code: Code, array: Value, floor: Value) -> Iterator[_Line]:
                 bottom=builder.select(has_below, whole(WINDOW), whole(WINDOW - 1)),
                 row=lambda i: place(code.sum(y.index, i, WINDOW - 1)),
             )
-    code.call("free", ir.VoidType(), scratch)
 
 
-def _convolve(code: Code, images: Value, kernel: Value, bias: Value, floor: Value, result: Value) -> None:
+def _convolve(code: Code, images: Value, kernel: Value, bias: Value, floor: Value, result: Value, rows: Value) -> None:
     """Of images (N, H, W, C), kernel (3, 3, C, D), bias (D) and floor () the result (N, H, W, D)."""
     (_, _, width, num_in), (_, _, _, num_out) = code.shape(images), code.shape(result)
     inputs = code.product(WINDOW, num_in)
     in_blocks = code.multiple(width, PIXELS)
-    with _lines(code, images, floor) as line, code.loop(0, num_out, OUTPUTS) as channel:
+    with _lines(code, images, floor, rows) as line, code.loop(0, num_out, OUTPUTS) as channel:
         biases = code.vectors(code.at(code.data(bias), channel.index))
         for start, stop, pixels in ((0, in_blocks, PIXELS), (in_blocks, width, 1)):
             with code.loop(start, stop, pixels) as x:
@@ -126,14 +135,14 @@ def _convolve(code: Code, images: Value, kernel: Value, bias: Value, floor: Valu
                     code.put_vectors(sums, code.at(code.data(result), pixel, channel.index))
 
 
-def _correlate(code: Code, images: Value, cotangent: Value, floor: Value, result: Value) -> None:
+def _correlate(code: Code, images: Value, cotangent: Value, floor: Value, result: Value, rows: Value) -> None:
     """Of images (N, H, W, C), the result's cotangent (N, H, W, D) and floor () the kernel's gradient (3, 3, C, D)."""
     (_, _, width, num_in), (_, _, _, num_out) = code.shape(images), code.shape(result)
     inputs = code.product(WINDOW, num_in)
     in_blocks = code.multiple(inputs, INPUTS)
     total = code.data(result)
     code.call("memset", POINTER, total, INT32(0), code.product(WINDOW, inputs, num_out, FLOAT_BYTES))
-    with _lines(code, images, floor) as line, code.loop(line.top, line.bottom) as window:
+    with _lines(code, images, floor, rows) as line, code.loop(line.top, line.bottom) as window:
         row = line.row(window.index)
         with code.loop(0, num_out, OUTPUTS) as channel:
             changes = code.at(code.data(cotangent), code.product(line.pixel, num_out), channel.index)

@@ -22,20 +22,21 @@ VECTOR = ir.VectorType(FLOAT, LANES)
 MULTIPLY_ADD = f"llvm.fmuladd.v{LANES}f32"
 
 Value = Any  # of LLVM's intermediate representation
-Write = Callable[..., None]  # of the code, and of the arguments' and the result's arrays: writes what is done
+Write = Callable[..., None]  # of the code, and of the arguments' and the results' arrays: writes what is done
 
 _engines: list[binding.ExecutionEngine] = []  # machine code lives as long as they do
 
 
-def compile_and_register(functions: dict[str, tuple[Write, int]]) -> None:
+def compile_and_register(functions: dict[str, tuple[Write, int, int]]) -> None:
     """Makes functions what programs on the CPU call.
 
     Args:
-        functions: by the names under which XLA calls them: what writes one, and how many arguments it has.
+        functions: by the names under which XLA calls them: what writes one, how many arguments and how many results
+            it has.
     """
     module = ir.Module()
-    for target, (write, num_arguments) in functions.items():
-        _define_handler(module, target, write, num_arguments)
+    for target, (write, num_arguments, num_results) in functions.items():
+        _define_handler(module, target, write, num_arguments, num_results)
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
     processor, features = binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
@@ -156,7 +157,7 @@ class Code:
         return self.builder.call(known or ir.Function(self.module, kind, name), arguments)
 
 
-def _define_handler(module: ir.Module, target: str, write: Write, num_arguments: int) -> None:
+def _define_handler(module: ir.Module, target: str, write: Write, num_arguments: int, num_results: int) -> None:
     """What XLA calls: answers which version of its interface this is, or finds the arrays and does the work.
 
     It always succeeds: who writes the call sees to shapes and dtypes.
@@ -186,7 +187,7 @@ def _define_handler(module: ir.Module, target: str, write: Write, num_arguments:
     write(
         code,
         *arrays(ffi.CallFrame.arguments.offset, num_arguments),
-        *arrays(ffi.CallFrame.results.offset, 1),
+        *arrays(ffi.CallFrame.results.offset, num_results),
     )
     builder.ret(success)
 
