@@ -43,13 +43,13 @@ class Processes:
         """Does it in the first process; the others wait.
 
         Raises:
-            ConfigError: in all of them, where it does in the first.
+            ConfigError: in all of them, where it does in the first, or where that has an OSError, which it raises.
         """
-        failed: ConfigError | None = None
+        failed: ConfigError | OSError | None = None
         if self.is_first:
             try:
                 do()
-            except ConfigError as error:
+            except (ConfigError, OSError) as error:
                 failed = error
         if self.any(failed is not None):
             raise failed or ConfigError("the first process refused; it says why")

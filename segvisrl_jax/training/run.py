@@ -66,15 +66,17 @@ class Run:
         self._policy_waiting: Callable[[], None] | None = None
         self._failing: set[str] = set()
         with contextlib.ExitStack() as stack:
-            self._writer = None
-            if self._is_first:
-                stack.enter_context(contextlib.closing(RunLock(self.folder)))
-                trackers = open_trackers(config, self.folder)
-                self._writer = stack.enter_context(MetricsWriter(self.folder, trackers=trackers, say=say))
+            self._writer: MetricsWriter | None = None
+            processes.on_first(lambda: self._open_writer(stack))
             self._checkpoints = Checkpoints(self.folder, processes, say)
             self.num_saved = self._checkpoints.latest
             stack.callback(self._checkpoints.close)
             self._open = stack.pop_all()
+
+    def _open_writer(self, stack: contextlib.ExitStack) -> None:
+        stack.enter_context(contextlib.closing(RunLock(self.folder)))
+        trackers = open_trackers(self.config, self.folder)
+        self._writer = stack.enter_context(MetricsWriter(self.folder, trackers=trackers, say=self.say))
 
     def restore(self, like: Any) -> Any:
         """The state of the newest checkpoint, and what the host knew then.
@@ -212,7 +214,7 @@ def open_runs(config: TrainConfig, processes: Processes, say: Callable[[str], No
             run.close()
         for settings in config.runs:
             folder = Path(settings.runs_dir) / settings.run_name
-            if not config.resume and not is_being_trained(folder):
+            if processes.is_first and not config.resume and not is_being_trained(folder):
                 shutil.rmtree(folder)
         raise
     return opened

@@ -1,5 +1,6 @@
 """Several processes that train together are one run: two real ones, over loopback."""
 
+import contextlib
 import json
 import os
 import signal
@@ -11,7 +12,9 @@ import time
 import numpy as np
 import pytest
 
+from segvisrl_jax.cli import INTERRUPTED
 from segvisrl_jax.config import ConfigError, TrainConfig
+from segvisrl_jax.training.run_lock import RunLock
 
 COUNT, START_S, END_S = 2, 400, 60
 TINY = """--arch mlp --preset smoke --ppo.num-envs 16 --ppo.unroll-length 8 --ppo.num-minibatches 2 --run run
@@ -63,6 +66,13 @@ def rows(folder):
     return [{name: value for name, value in json.loads(line).items() if "time" not in name} for line in lines]
 
 
+def wait_for_rows(folder, processes, count):
+    deadline = time.monotonic() + START_S
+    while len(rows(folder)) < count and time.monotonic() < deadline:
+        assert all(process.poll() is None for process in processes), (folder / "0").read_text()
+        time.sleep(0.5)
+
+
 @pytest.mark.slow
 def test_two_processes_train_as_one_does(tmp_path):
     one, two = tmp_path / "one", tmp_path / "two"
@@ -83,10 +93,7 @@ def test_two_processes_train_as_one_does(tmp_path):
 def test_one_is_killed_the_other_ends_and_the_run_goes_on(victim, tmp_path):
     folder = tmp_path / "runs"
     processes = start(folder, "--steps 1e6 --checkpoint-every-updates 4 --evaluation.every-decisions 1e6")
-    deadline = time.monotonic() + START_S
-    while len(rows(folder)) < 10 and time.monotonic() < deadline:
-        assert all(process.poll() is None for process in processes), (folder / "0").read_text()
-        time.sleep(0.5)
+    wait_for_rows(folder, processes, 10)
     processes[victim].kill()
     codes, said = wait(folder, processes, END_S)
     assert codes[victim] == -signal.SIGKILL
@@ -99,6 +106,27 @@ def test_one_is_killed_the_other_ends_and_the_run_goes_on(victim, tmp_path):
     assert codes == [0, 0], said
     assert f"going on from update {reached} of {reached + 1}" in said[0]
     assert len(rows(folder)) == reached + 1
+
+
+@pytest.mark.slow
+def test_all_stop_where_one_is_told_to_and_none_begins_where_the_first_cannot(tmp_path):
+    folder = tmp_path / "runs"
+    processes = start(folder, "--steps 1e6 --checkpoint-every-updates 1000000 --evaluation.every-decisions 1e6")
+    wait_for_rows(folder, processes, 3)
+    processes[1].send_signal(signal.SIGTERM)
+    codes, said = wait(folder, processes, END_S)
+    assert codes == [INTERRUPTED] * COUNT, said
+    reached = len(rows(folder))
+    assert os.listdir(folder / "run" / "checkpoints") == [str(reached)]
+    assert "--resume" in said[0]
+    go_on = f"--resume --steps {128 * (reached + 1)}"
+    with contextlib.closing(RunLock(folder / "run")):
+        codes, said = wait(folder, start(folder, go_on))
+    assert codes == [2, 2], said
+    assert "another process is training it" in said[0]
+    codes, said = wait(folder, start(folder, go_on))
+    assert codes == [0, 0], said
+    assert f"going on from update {reached} of {reached + 1}" in said[0]
 
 
 @pytest.mark.parametrize(
