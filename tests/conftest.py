@@ -19,7 +19,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 MAPS = Path("/proc/self/maps")  # Linux: a line for each piece of this process's memory
-MOST_MAPS = 20_000  # Linux allows 65,530 (vm.max_map_count); beyond, LLVM ends the process while it compiles
+MOST_MAPS = 20_000  # Linux allows 65,530 (vm.max_map_count); beyond, compiling ends the process
 
 settings.register_profile(
     "repeatable",

@@ -184,9 +184,10 @@ def _call(name: str, shapes: Sequence[tuple[int, ...]], *arrays: Float32[Array, 
 
 
 def _padded_rows(images: Images) -> tuple[int, ...]:
-    """The shape of the memory that a kernel needs to look at images; from XLA, which knows how much there is."""
+    """The shape of the memory that a kernel needs to look at images: a result that nothing reads."""
+    assert kernels is not None
     _, _, width, num_channels = images.shape
-    return WINDOW[0], width + WINDOW[1] - 1, num_channels
+    return kernels.WINDOW, width + kernels.PADDING, num_channels
 
 
 def _fill_up(array: Float32[Array, "... D"]) -> Float32[Array, "... E"]:

@@ -176,8 +176,8 @@ def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | N
         DivergedError: where no loss or gradient was finite for ``max_bad_updates`` updates.
     """
     processes = join(config)
-    first_params = None if config.resume else _params_to_start_from(config)
-    require_installed(config.loggers)
+    processes.together(lambda: require_installed(config.loggers))
+    first_params = None if config.resume else processes.together(lambda: _params_to_start_from(config))
     processes.on_first(lambda: open_run_dirs(config))
     with contextlib.ExitStack() as stack:
         runs = open_runs(config, processes, say if processes.is_first else _say_nothing)

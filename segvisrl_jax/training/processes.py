@@ -8,13 +8,15 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NoReturn
+from typing import NoReturn, TypeVar
 
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
 from segvisrl_jax.config import ConfigError, TrainConfig
+
+ResultT = TypeVar("ResultT")
 
 HEARTBEAT_S = 30  # a process that has not been heard of for this long is given up by the others
 JOIN_S = 300  # how long the first ones wait for the last one
@@ -39,20 +41,24 @@ class Processes:
             return asked
         return bool(np.any(multihost_utils.process_allgather(np.array(asked))))
 
-    def on_first(self, do: Callable[[], object]) -> None:
-        """Does it in the first process; the others wait.
+    def together(self, do: Callable[[], ResultT]) -> ResultT:
+        """Does it in every process, and goes on where all of them could.
 
         Raises:
-            ConfigError: in all of them, where it does in the first, or where that has an OSError, which it raises.
+            ConfigError: in all of them, where one has it or an OSError; that one raises its own.
         """
         failed: ConfigError | OSError | None = None
-        if self.is_first:
-            try:
-                do()
-            except (ConfigError, OSError) as error:
-                failed = error
+        try:
+            result = do()
+        except (ConfigError, OSError) as error:
+            failed = error
         if self.any(failed is not None):
-            raise failed or ConfigError("the first process refused; it says why")
+            raise failed or ConfigError("another process of the run refused; it says why")
+        return result
+
+    def on_first(self, do: Callable[[], object]) -> None:
+        """Does it in the first process; the others wait, and raise where it does: see ``together``."""
+        self.together(lambda: do() if self.is_first else None)
 
     def leave(self) -> None:
         """Parts from the others, once all are done."""

@@ -27,7 +27,7 @@ def free_port():
         return probe.getsockname()[1]
 
 
-def start(folder, words, count=COUNT):
+def start(folder, words, count=COUNT, of_last=""):
     """``segvisrl train`` in ``count`` processes, their output in ``folder``/0, /1, ..."""
     folder.mkdir(exist_ok=True)
     common = [
@@ -45,7 +45,7 @@ def start(folder, words, count=COUNT):
     for i in range(count):
         told = ["--coordinator", f"127.0.0.1:{port}", "--num-processes", str(count), "--process-id", str(i)]
         with (folder / str(i)).open("wb") as output:
-            command = [*common, *(told if count > 1 else [])]
+            command = [*common, *(told if count > 1 else []), *(of_last.split() if i == count - 1 else [])]
             processes.append(subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT))
     return processes
 
@@ -68,8 +68,9 @@ def rows(folder):
 
 def wait_for_rows(folder, processes, count):
     deadline = time.monotonic() + START_S
-    while len(rows(folder)) < count and time.monotonic() < deadline:
+    while len(rows(folder)) < count:
         assert all(process.poll() is None for process in processes), (folder / "0").read_text()
+        assert time.monotonic() < deadline
         time.sleep(0.5)
 
 
@@ -127,6 +128,16 @@ def test_all_stop_where_one_is_told_to_and_none_begins_where_the_first_cannot(tm
     codes, said = wait(folder, start(folder, go_on))
     assert codes == [0, 0], said
     assert f"going on from update {reached} of {reached + 1}" in said[0]
+
+
+@pytest.mark.slow
+def test_where_one_cannot_begin_none_does(tmp_path):
+    folder = tmp_path / "runs"
+    codes, said = wait(folder, start(folder, "--steps 384", of_last="--start-from nowhere"), END_S)
+    assert codes == [2, 2], said
+    assert "another process of the run refused" in said[0]
+    assert "nowhere" in said[1]
+    assert not (folder / "run").exists()
 
 
 @pytest.mark.parametrize(
