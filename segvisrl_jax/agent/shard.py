@@ -1,7 +1,7 @@
-"""Which part of all environments a program sees, where several devices share them.
+"""Which part of all environments a program sees, where several devices, or cores of one, share them.
 
-Programs are written once: with ``WHOLE`` on one device, with a ``Shard`` inside ``jax.shard_map``. Random numbers are
-drawn for all environments and cut, so that a run is the same on any number of devices, up to the order of sums.
+Programs are written once: with ``WHOLE`` on one device, with a ``Shard`` inside ``jax.shard_map`` or on a core. Random
+numbers are drawn for all environments and cut, so that a run is the same on any number of them, up to the order of sums.
 """
 
 from dataclasses import dataclass
@@ -9,24 +9,26 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float32, Shaped
+from jaxtyping import Array, Float32, Int32, Shaped
 
 TreeT = TypeVar("TreeT")
 
 
 @dataclass(frozen=True)
 class Shard:
-    """One of ``count`` equal parts, along an axis of the devices' mesh. Hashable."""
+    """One of ``count`` equal parts: along an axis of the devices' mesh, or that with a number. Hashable without one."""
 
     axis: str | None = None
     count: int = 1
+    number: Int32[Array, ""] | None = None
 
     def of(self, whole: Shaped[Array, "N ..."]) -> Shaped[Array, "n ..."]:
         """The rows that belong to this part; n = N / count."""
-        if self.axis is None:
+        if self.count == 1:
             return whole
         size = whole.shape[0] // self.count
-        return jax.lax.dynamic_slice_in_dim(whole, jax.lax.axis_index(self.axis) * size, size)
+        number = self.number if self.axis is None else jax.lax.axis_index(self.axis)
+        return jax.lax.dynamic_slice_in_dim(whole, number * size, size)
 
     def mean(self, tree: TreeT) -> TreeT:
         """The mean over all parts, of every leaf."""

@@ -2,11 +2,15 @@
 
 Episode i of a seed is always the same scene (``fold_in`` of the stream's key with i), however many episodes are
 driven at a time and whoever drives.
+
+A policy that looks at images drives on every core of a CPU (``training.cores``): each has its share of the slots, and
+of N cores the first one has the episodes 0, N, 2 N, and so on.
 """
 
 import dataclasses
 import functools
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -17,17 +21,19 @@ from jaxtyping import Array, Bool, Int32, PRNGKeyArray
 
 from segvisrl_jax.env.rover_env import RoverEnv
 from segvisrl_jax.env.wrappers import select
+from segvisrl_jax.training.cores import acting_cores
 from segvisrl_jax.training.policy import Policy
 from segvisrl_jax.training.shortest_path import shortest_path_m
 from segvisrl_jax.training.statistics import path_ratio, spl, wilson_interval
 from segvisrl_jax.types import Outcome, RoverState
 
+IMAGE_RANK = 3  # axes of an observation that is an image
 DECISIONS_PER_CALL = 10  # of every slot between two looks of the host at what has finished
 
 
 @struct.dataclass
 class Slots:
-    """S episodes that are being driven."""
+    """S episodes that are being driven, on one core."""
 
     rover: RoverState
     episode: Int32[Array, "S"]  # which episode each slot drives; beyond the last: idle
@@ -59,6 +65,8 @@ class Evaluator:
     num_slots: int
 
     def __post_init__(self) -> None:
+        looks = self.policy.observes and len(self.env.observation_shape) == IMAGE_RANK
+        self._num_cores = acting_cores(self.num_slots) if looks else 1
         self._start = jax.jit(self._begin)
         self._drive = jax.jit(self._drive_some)
 
@@ -71,25 +79,32 @@ class Evaluator:
     ) -> Finished:
         """Drives episodes 0 to ``episodes`` - 1 of a scene stream, each to its end."""
         number = jnp.int32(episodes)
-        slots = self._start(stream, number)
+
+        def drive(step: int, slots: Slots) -> tuple[Slots, dict[str, Array]]:
+            return jax.block_until_ready(self._drive(params, slots, stream, number, jnp.int32(step)))
+
+        slots = [self._start(stream, jnp.int32(core)) for core in range(self._num_cores)]
         found: dict[int, dict[str, np.ndarray]] = {}
         step = 0
-        while len(found) < episodes:
-            slots, ended = self._drive(params, slots, stream, number, jnp.int32(step))
-            _collect(jax.device_get(ended), found)
-            on_progress(len(found))
-            step += 1
+        with ThreadPoolExecutor(self._num_cores, "segvisrl-driving") as pool:
+            while len(found) < episodes:
+                slots, ended = zip(*pool.map(functools.partial(drive, step), slots), strict=True)
+                for of_core in jax.device_get(ended):
+                    _collect(of_core, found)
+                on_progress(len(found))
+                step += 1
         rows = [found[i] for i in range(episodes)]
         return Finished(**{name: np.stack([row[name] for row in rows]) for name in rows[0]})
 
-    def _begin(self, stream: PRNGKeyArray, episodes: Array) -> Slots:
-        episode = jnp.arange(self.num_slots, dtype=jnp.int32)
+    def _begin(self, stream: PRNGKeyArray, core: Int32[Array, ""]) -> Slots:
+        num_slots = self.num_slots // self._num_cores
+        episode = core + self._num_cores * jnp.arange(num_slots, dtype=jnp.int32)
         return Slots(
             rover=self._scenes(stream, episode),
             episode=episode,
-            next_episode=jnp.int32(self.num_slots),
-            is_first=jnp.ones(self.num_slots, jnp.float32),
-            carry=self.policy.initial_carry(self.num_slots),
+            next_episode=core + self._num_cores * num_slots,
+            is_first=jnp.ones(num_slots, jnp.float32),
+            carry=self.policy.initial_carry(num_slots),
         )
 
     def _scenes(self, stream: PRNGKeyArray, episode: Int32[Array, "S"]) -> RoverState:
@@ -115,13 +130,13 @@ class Evaluator:
 
     def _refill(self, stream: PRNGKeyArray, done: Bool[Array, "S"], slots: Slots) -> Slots:
         """Slots whose episode ended take the next numbers."""
-        following = slots.next_episode + jnp.cumsum(done, dtype=jnp.int32) - 1
+        following = slots.next_episode + self._num_cores * (jnp.cumsum(done, dtype=jnp.int32) - 1)
         episode = jnp.where(done, following, slots.episode)
         return dataclasses.replace(
             slots,
             rover=select(done, self._scenes(stream, episode), slots.rover),
             episode=episode,
-            next_episode=slots.next_episode + jnp.sum(done, dtype=jnp.int32),
+            next_episode=slots.next_episode + self._num_cores * jnp.sum(done, dtype=jnp.int32),
             is_first=done.astype(jnp.float32),
         )
 

@@ -17,10 +17,12 @@ from rich.console import Console
 
 from segvisrl_jax.agent.networks import Network, Params, make_network
 from segvisrl_jax.agent.ppo import Learner, LearnerState, make_learner
+from segvisrl_jax.agent.shard import Shard
 from segvisrl_jax.config import ConditionsConfig, EnvConfig, TrainConfig, replace_fields, require
 from segvisrl_jax.env.rover_env import RoverEnv, observation_shape
 from segvisrl_jax.env.wrappers import VALIDATION_STREAM, BatchEnv, scene_stream
 from segvisrl_jax.training.checkpoint import load_policy
+from segvisrl_jax.training.cores import Cores, acting_cores
 from segvisrl_jax.training.devices import ACTOR, BY_ENV, BY_TIME_AND_ENV, EVERYWHERE, TRAJECTORY, Devices
 from segvisrl_jax.training.evaluation import Evaluator, summarize
 from segvisrl_jax.training.metrics import ProgressDisplay
@@ -71,15 +73,21 @@ class Trainer:
         self.network: Network = make_network(config.arch, config.network, env.observation_shape)
         draw = jax.vmap(jax.vmap(env.observe)) if config.ppo.redraw_observations else None
         self.learner: Learner = make_learner(self.network, config.ppo, config.num_updates, draw=draw, shard=shard)
-        self.batch = BatchEnv(env, config.ppo.num_envs // shard.count)
+        on_host = self.learner.execution == "host"
+        self.cores = Cores(acting_cores(config.ppo.num_envs) if on_host else 1)
+        self.batch = BatchEnv(env, config.ppo.num_envs // shard.count // self.cores.count)
         self.policy: Policy = network_policy(self.network, config.arch)
         self.evaluator = Evaluator(RoverEnv(validation_env(config)), self.policy, config.evaluation.num_slots)
         self._lay_out = self.devices.lay_out(lambda key: key, EVERYWHERE)
         self._split = self.devices.lay_out(lambda key: tuple(jax.random.split(key)), EVERYWHERE)
         self._init = self.devices.lay_out(self.learner.init, EVERYWHERE)
         self._begin = self.devices.lay_out(lambda key: start_acting(key, config.ppo.num_envs, env, self.network), ACTOR)
-        acted = (ACTOR, TRAJECTORY, BY_ENV, BY_TIME_AND_ENV)
-        self._unroll = self.devices.share(jax.jit(self._unroll_batch), (EVERYWHERE, ACTOR), acted)
+        acting, acted = (EVERYWHERE, ACTOR), (ACTOR, TRAJECTORY, BY_ENV, BY_TIME_AND_ENV)
+        if self.cores.count > 1:
+            self._unroll = self.cores.share(self._unroll_batch, acting, acted)
+        else:
+            unroll_batch = functools.partial(self._unroll_batch, shard)
+            self._unroll = self.devices.share(jax.jit(unroll_batch), acting, acted)
         given = (EVERYWHERE, TRAJECTORY, BY_ENV, EVERYWHERE)
         self._learn = self.devices.share(self.learner.update, given, (EVERYWHERE, EVERYWHERE))
         if config.num_seeds > 1:
@@ -136,8 +144,8 @@ class Trainer:
         finished = self.evaluator.run(self.devices.on_one(params), stream, self.config.evaluation.episodes)
         return summarize(finished, self.evaluator.env)
 
-    def _unroll_batch(self, learner: LearnerState, actor: ActorState):
-        return unroll(learner.params, actor, self.batch, self.network, self.config.ppo, self.devices.shard)
+    def _unroll_batch(self, shard: Shard, learner: LearnerState, actor: ActorState):
+        return unroll(learner.params, actor, self.batch, self.network, self.config.ppo, shard)
 
 
 def held_out_env(config: EnvConfig) -> EnvConfig:
