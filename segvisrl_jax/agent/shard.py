@@ -1,7 +1,7 @@
 """Which part of all environments a program sees, where several devices, or cores of one, share them.
 
 Programs are written once: with ``WHOLE`` on one device, with a ``Shard`` inside ``jax.shard_map`` or on a core. Random
-numbers are drawn for all environments and cut, so that a run is the same on any number of them, up to the order of sums.
+numbers are drawn for all environments and cut: a run is the same on any number of them, up to the order of sums.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ class Shard:
 
     axis: str | None = None
     count: int = 1
-    number: Int32[Array, ""] | None = None
+    number: Int32[Array, ""] | int = 0
 
     def of(self, whole: Shaped[Array, "N ..."]) -> Shaped[Array, "n ..."]:
         """The rows that belong to this part; n = N / count."""

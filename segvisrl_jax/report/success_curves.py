@@ -245,7 +245,7 @@ def _set_axis(axes: Axes, field: str, values: Sequence[float], evaluations: Sequ
     beyond = SIDE_SHARE * (right - left)
     axes.set_xlim(*forward.inverted().transform(np.array([left - beyond, right + beyond])))
     shown = values if len(values) <= MOST_TICKS else values[:: -(-len(values) // MOST_TICKS)]
-    axes.set_xticks(shown, [_tick(field, value, evaluations) for value in shown])
+    axes.set_xticks(shown, [_tick(field, value, evaluations) for value in shown], fontsize="x-small")
     axes.xaxis.set_minor_formatter(FuncFormatter(lambda value, place: ""))
     axes.minorticks_off()
     axes.set_xlabel(axis_name(field))

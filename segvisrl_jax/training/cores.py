@@ -47,7 +47,7 @@ class Cores:
 
         @jax.jit
         def cut(*given):
-            return [jax.tree.map(lambda kind, tree: self._part(kind, tree, i), takes, given) for i in range(self.count)]
+            return [self._parts(takes, given, number) for number in range(self.count)]
 
         @jax.jit
         def join(*parts):
@@ -60,11 +60,14 @@ class Cores:
 
         return shared
 
-    def _part(self, kind: Any, tree: Any, number: int) -> Any:
-        axis = _env_axis(kind)
-        if axis is None:
-            return tree
-        return jax.tree.map(lambda leaf: jnp.split(leaf, self.count, axis)[number], tree)
+    def _parts(self, kinds: Any, trees: Any, number: int) -> Any:
+        """What the core with this number has."""
+
+        def part(kind: Any, tree: Any) -> Any:
+            axis = _env_axis(kind)
+            return tree if axis is None else jax.tree.map(lambda leaf: jnp.split(leaf, self.count, axis)[number], tree)
+
+        return jax.tree.map(part, kinds, trees)
 
 
 def _finish(work: Callable[..., Any], *given: Any) -> Any:

@@ -83,7 +83,7 @@ class Evaluator:
         def drive(step: int, slots: Slots) -> tuple[Slots, dict[str, Array]]:
             return jax.block_until_ready(self._drive(params, slots, stream, number, jnp.int32(step)))
 
-        slots = [self._start(stream, jnp.int32(core)) for core in range(self._num_cores)]
+        slots = tuple(self._start(stream, jnp.int32(core)) for core in range(self._num_cores))
         found: dict[int, dict[str, np.ndarray]] = {}
         step = 0
         with ThreadPoolExecutor(self._num_cores, "segvisrl-driving") as pool:

@@ -53,7 +53,8 @@ def test_two_cores_take_turns_with_the_episodes(config, monkeypatch):
 
     progress: list[int] = []
     one, two = drive(1, []), drive(2, progress)
-    assert progress == sorted(progress) and progress[-1] == EPISODES
+    assert progress == sorted(progress)
+    assert progress[-1] == EPISODES
     np.testing.assert_array_equal(one.goal_xy_m, two.goal_xy_m)
     np.testing.assert_array_equal(one.outcome, two.outcome)
     np.testing.assert_allclose(one.path_length_m, two.path_length_m, rtol=1e-3)
