@@ -19,6 +19,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Int32, PRNGKeyArray
 
+from segvisrl_jax.config import IMAGE_OBSERVATIONS
 from segvisrl_jax.env.rover_env import RoverEnv
 from segvisrl_jax.env.wrappers import select
 from segvisrl_jax.training.cores import acting_cores
@@ -27,7 +28,6 @@ from segvisrl_jax.training.shortest_path import shortest_path_m
 from segvisrl_jax.training.statistics import path_ratio, spl, wilson_interval
 from segvisrl_jax.types import Outcome, RoverState
 
-IMAGE_RANK = 3  # axes of an observation that is an image
 DECISIONS_PER_CALL = 10  # of every slot between two looks of the host at what has finished
 
 
@@ -65,7 +65,7 @@ class Evaluator:
     num_slots: int
 
     def __post_init__(self) -> None:
-        looks = self.policy.observes and len(self.env.observation_shape) == IMAGE_RANK
+        looks = self.policy.observes and self.env.config.obs in IMAGE_OBSERVATIONS
         self._num_cores = acting_cores(self.num_slots) if looks else 1
         self._start = jax.jit(self._begin)
         self._drive = jax.jit(self._drive_some)
