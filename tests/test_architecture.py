@@ -88,6 +88,14 @@ def test_importing_the_package_loads_neither_jax_nor_mujoco():
     assert said.stdout.strip() == "[]"
 
 
+def test_a_training_waits_for_no_library_that_it_may_not_need():
+    heavy = "[name for name in ('scipy.stats', 'matplotlib', 'torch') if name in sys.modules]"
+    make = "RoverEnv(EnvConfig())"
+    code = f"import sys; from segvisrl_jax.training.loop import EnvConfig, RoverEnv; {make}; print({heavy})"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert said.stdout.strip() == "[]"
+
+
 def test_public_names_exist():
     for name in segvisrl_jax.__all__:
         assert getattr(segvisrl_jax, name) is not None

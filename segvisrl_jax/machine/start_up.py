@@ -12,7 +12,8 @@ from typing import Any
 
 from segvisrl_jax.machine.programs import FOLDER_VARIABLE
 
-NUM_UPDATES = 3  # the first waits for all compilation; the second and third tell what an update takes
+NUM_UPDATES = 4
+NUM_UNUSUAL = 2  # the first waits for all compilation, the second for TensorBoard's import; the others tell of the rest
 POLL_SECONDS = 0.05
 PATIENCE_SECONDS = 1800
 
@@ -25,8 +26,8 @@ def start_rows(arch: str, preset: str) -> Iterator[dict[str, Any]]:
         preset: likewise.
 
     Yields:
-        Seconds from the start of the process to the end of its first update, what an update takes, and the difference:
-        what comes before learning. The size of the folder in MB.
+        Seconds from the start of the process to the end of its first update, what a later update takes, and the
+        difference: what comes before learning. The size of the folder in MB.
 
     Raises:
         RuntimeError: where the training ends before it has made ``NUM_UPDATES`` updates; the message is its last line.
@@ -39,7 +40,7 @@ def start_rows(arch: str, preset: str) -> Iterator[dict[str, Any]]:
             run = start.split()[0]
             words = ["train", "--arch", arch, "--preset", preset, "--run", run, "--runs-dir", name]
             ends = _ends_of_updates([sys.executable, "-m", "segvisrl_jax.cli", *words], environment, folder / run)
-            update = (ends[-1] - ends[0]) / (NUM_UPDATES - 1)
+            update = (ends[-1] - ends[NUM_UNUSUAL - 1]) / (NUM_UPDATES - NUM_UNUSUAL)
             kept = sum(file.stat().st_size for file in (folder / "cache").rglob("*") if file.is_file())
             times = {
                 "first_update_ends_s": ends[0],

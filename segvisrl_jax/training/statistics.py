@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import binomtest
 
 from segvisrl_jax.config import require
 
@@ -31,6 +30,8 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
     require(trials >= 1, "trials", trials, "at least 1")
     require(0 <= successes <= trials, "successes", successes, f"in [0, trials = {trials}]")
     require(0 < confidence < 1, "confidence", confidence, "between 0 and 1")
+    from scipy.stats import binomtest  # when first used: half a second, which a training needs not wait for
+
     interval = binomtest(successes, trials).proportion_ci(confidence, method="wilson")
     return float(interval.low), float(interval.high)
 
@@ -85,6 +86,8 @@ def mcnemar_p_value(only_first: int, only_second: int) -> float:
     differing = only_first + only_second
     if differing == 0:
         return 1.0
+    from scipy.stats import binomtest
+
     return float(binomtest(only_first, differing, 0.5).pvalue)
 
 
