@@ -2,13 +2,14 @@
 
 ``python train_on_ray.py PROCESSES [--address ADDRESS] OPTION ...``: the options are those of ``segvisrl train``. Each
 process takes all GPUs of its share (``--num-devices`` says how many there are), and all see ``--runs-dir``. The output
-is that of the first one.
+is that of the first one, line by line.
 """
 
 import argparse
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 
 import ray
 from ray.util.placement_group import placement_group
@@ -22,12 +23,24 @@ def address() -> str:
         return f"{ray.util.get_node_ip_address()}:{probe.getsockname()[1]}"
 
 
-def train(options: list[str], coordinator: str, count: int, index: int) -> tuple[int, str]:
-    """One process: its exit code and what it said."""
+def train(options: list[str], coordinator: str, count: int, index: int) -> Iterator[str | int]:
+    """One process: what it says, line by line, then its exit code."""
     told = ["--coordinator", coordinator, "--num-processes", str(count), "--process-id", str(index)]
-    command = [sys.executable, "-m", "segvisrl_jax.cli", "train", *options, *told]
-    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
-    return done.returncode, done.stdout
+    command = [sys.executable, "-u", "-m", "segvisrl_jax.cli", "train", *options, *told]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        for line in process.stdout:  # noqa: UP028  (Ray sends into its generators, which files do not understand)
+            yield line
+    yield process.returncode
+
+
+def wait_for(answers: Iterator[ray.ObjectRef], shown: bool) -> tuple[int, str]:
+    """The exit code of a process and what it said, which is printed as it comes where asked."""
+    said = []
+    for answer in answers:
+        said.append(ray.get(answer))
+        if shown and isinstance(said[-1], str):
+            print(said[-1], end="", flush=True)
+    return said.pop(), "".join(said)
 
 
 def main() -> int:
@@ -52,9 +65,8 @@ def main() -> int:
     started = [
         on_node(i, train, **takes).remote(options, coordinator, asked.processes, i) for i in range(asked.processes)
     ]
-    ended = ray.get(started)
-    print(ended[0][1], end="")
-    failed = [f"process {i}: exit code {code}\n{said}" for i, (code, said) in enumerate(ended) if code]
+    ended = [wait_for(answers, shown=i == 0) for i, answers in enumerate(started)]
+    failed = [f"process {i}: exit code {code}\n{said if i else ''}" for i, (code, said) in enumerate(ended) if code]
     print("\n".join(failed), end="", file=sys.stderr)
     return 1 if failed else 0
 

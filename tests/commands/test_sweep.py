@@ -140,9 +140,14 @@ def test_one_run_on_two_nodes(tmp_path, cluster):
     script = Path(__file__).parents[2] / "deploy" / "train_on_ray.py"
     words = ["--preset", "smoke", "--steps", "256", *TINY, "--run", "both", "--runs-dir", str(tmp_path)]
     command = [sys.executable, str(script), "2", "--address", cluster.address, *words]
-    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "JAX_PLATFORMS": "cpu"})
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.count("test scenes:") == 1
+    piped = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, **piped, env={**os.environ, "JAX_PLATFORMS": "cpu"}) as process:
+        said = [process.stdout.readline()]
+        assert process.poll() is None  # it is heard of before the end
+        rest, errors = process.communicate()
+    said.append(rest)
+    assert process.returncode == 0, "".join(said) + errors
+    assert "".join(said).count("test scenes:") == 1
     config = json.loads((tmp_path / "both" / "config.json").read_text())
     assert config["num_processes"] == 2
     assert (tmp_path / "both" / "policy" / "policy.json").exists()
