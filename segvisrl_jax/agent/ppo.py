@@ -278,7 +278,7 @@ class Learner:
         with jax.numpy_dtype_promotion("standard"):  # optax multiplies whole numbers by floats
             directions, opt_state = self.optimizer.update(gradient, state.opt_state, state.params)
         rate = self._learning_rate(state)
-        updates = jax.tree.map(lambda direction: -rate * direction, directions)
+        updates = jax.tree.map(lambda direction: -rate * self._share_of_rate(direction) * direction, directions)
         stepped = Progress(
             state=dataclasses.replace(
                 state,
@@ -301,6 +301,15 @@ class Learner:
         """Of all steps of the next update."""
         with jax.numpy_dtype_promotion("standard"):  # optax divides whole numbers
             return jnp.asarray(self.schedule(state.num_updates), jnp.float32) * state.rate_share
+
+    def _share_of_rate(self, weights: Float32[Array, "..."]) -> float:
+        """Of a wide dense kernel, (inputs, outputs), less than 1; of all else 1.
+
+        Adam moves every weight by the rate, so what a layer gives moves by the rate times its inputs (Yang et al.,
+        "Tensor programs V", arXiv:2203.03466, 2022).
+        """
+        most = self.config.full_rate_inputs
+        return min(1.0, most / weights.shape[0]) if most and weights.ndim == 2 else 1.0
 
     def _next_rate_share(self, share: Float32[Array, ""], kl: Float32[Array, ""]) -> Float32[Array, ""]:
         target = self.config.kl_target

@@ -85,6 +85,8 @@ class PPOConfig:
     """A batch's epochs end early once the policy moved this far (approximate KL); 0 never stops."""
     kl_target: float = 0.0
     """The rate falls below its line while updates move the policy farther than this, and comes back; 0 never."""
+    full_rate_inputs: int = 0
+    """Dense layers with more inputs than this learn at the rate times this over their number; 0: all at the rate."""
     redraw_observations: bool = False
     """Keep scenes and poses in place of images and draw these again in every epoch: less memory, more rendering."""
     bootstrap_on_timeout: bool = False
@@ -117,6 +119,8 @@ class PPOConfig:
         for name in ("entropy_cost", "value_cost", "kl_stop", "kl_target"):
             value = getattr(self, name)
             require(0 <= value <= 1e9, f"{p}.{name}", value, "0 or more, and at most 1e9")
+        inputs = self.full_rate_inputs
+        require(0 <= inputs <= 10**9, f"{p}.full_rate_inputs", inputs, "in [0, 1e9]; 0 slows no layer down")
 
 
 @dataclass(frozen=True)

@@ -262,6 +262,22 @@ def test_rate_falls_while_updates_move_the_policy_too_far_and_comes_back(executi
 
 
 @pytest.mark.parametrize("execution", ["host", "fused"])
+def test_a_dense_layer_with_many_inputs_learns_more_slowly_and_nothing_else_does(execution: str) -> None:
+    state, trajectory = rollout("cnn_lstm")
+    one_step = dataclasses.replace(CONFIG, num_epochs=1, num_minibatches=1)
+    moved = []
+    for inputs in (0, 12):
+        config = dataclasses.replace(one_step, full_rate_inputs=inputs)
+        after, _ = update(make_learner(built("cnn_lstm"), config, TOTAL_UPDATES, execution), state, trajectory)
+        moved.append(jax.tree.map(lambda new, old: np.asarray(new - old), after.params, state.params))
+    widest = state.params["params"]["body"]["Dense_0"]["kernel"].shape[0]
+    assert widest > 24
+    for (path, slowed), full in zip(jax.tree.leaves_with_path(moved[1]), jax.tree.leaves(moved[0]), strict=True):
+        share = min(1, 12 / full.shape[0]) if path[-1].key == "kernel" and full.ndim == 2 else 1
+        np.testing.assert_allclose(slowed, share * full, rtol=1e-3, atol=1e-7, err_msg=str(path))
+
+
+@pytest.mark.parametrize("execution", ["host", "fused"])
 def test_epochs_end_early_once_the_policy_moved_far(execution: str) -> None:
     state, trajectory = rollout("mlp")
     done = {}
