@@ -143,7 +143,7 @@ def test_one_run_on_two_nodes(tmp_path, cluster):
     piped = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, **piped, env={**os.environ, "JAX_PLATFORMS": "cpu"}) as process:
         said = [process.stdout.readline()]
-        assert process.poll() is None  # it is heard of before the end
+        assert not (tmp_path / "both" / "eval.json").exists()  # it is heard of before the end
         rest, errors = process.communicate()
     said.append(rest)
     assert process.returncode == 0, "".join(said) + errors
@@ -151,3 +151,4 @@ def test_one_run_on_two_nodes(tmp_path, cluster):
     config = json.loads((tmp_path / "both" / "config.json").read_text())
     assert config["num_processes"] == 2
     assert (tmp_path / "both" / "policy" / "policy.json").exists()
+    assert (tmp_path / "both" / "eval.json").exists()
