@@ -47,7 +47,7 @@ class TrajectoriesOptions:
     scenes: tuple[int, ...] = ()
     """Draw these scenes and search for none."""
     num_rocks: int | None = None
-    """Rocks on the map; default: as the first policy was trained with."""
+    """Rocks on the map; default: env.scene.num_rocks of the first policy's settings."""
     seed: int = 0
     """Names the test scenes, as for segvisrl eval."""
     output: Path = Path("figures/trajectories.png")
@@ -70,6 +70,7 @@ def work(asked: TrajectoriesOptions) -> None:
     stream = scene_stream(asked.seed, TEST_STREAM)
     methods = []
     for word, (policy, params, _), env in zip(asked.methods, drivers, envs, strict=True):
+        policy = CONTROLLERS[word](env.config) if word in CONTROLLERS else policy
         with ProgressDisplay(len(numbers), description=f"{driver_name(word)}: test scenes") as display:
             driven = drive_episodes(env, policy, params, stream, numbers, lambda done: display.update(done, {}))
         methods.append(Method(driver_name(word), policy.name, driven, env.dt))

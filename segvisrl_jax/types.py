@@ -54,7 +54,7 @@ class Scene:
 
     goal_xy_m: Float32[Array, "*B 2"]
     goal_yaw_rad: Float32[Array, "*B"]
-    rock_xy_m: Float32[Array, "*B R 2"]
+    rock_xy_m: Float32[Array, "*B R 2"]  # a rock that is not there stands at ``env.scene.FAR_AWAY_M``
     rock_yaw_rad: Float32[Array, "*B R"]
     rock_shape: Int32[Array, "*B R"]  # row of the rock library; all different within a scene
     start_yaw_rad: Float32[Array, "*B"]  # the rover's heading at the start

@@ -12,21 +12,23 @@ MAY_IMPORT = {  # part -> the parts it may import, besides itself
     "assets": set(),
     "config": set(),
     "types": set(),
+    "cpu": set(),
     "ffi": set(),
-    "env": {"assets", "config", "types", "ffi", "vision"},  # vision only from rover_env: see below
-    "vision": {"assets", "config", "types", "env"},  # env only its data: see below
-    "agent": {"config", "types", "ffi"},
-    "training": {"assets", "config", "types", "env", "vision", "agent"},
+    "env": {"assets", "config", "types", "cpu", "ffi", "vision"},  # vision only from rover_env: see below
+    "vision": {"assets", "config", "types", "cpu", "env"},  # env only its data: see below
+    "agent": {"config", "types", "cpu", "ffi"},
+    "training": {"assets", "config", "types", "cpu", "env", "vision", "agent"},
     "report": {"config", "types", "env", "vision", "training"},
     "adapters": {"config", "types", "env", "report"},
     "export": {"config", "env", "vision", "training", "agent", "report"},
     "sweep": {"config", "training"},
-    "machine": {"config", "env", "vision", "agent", "training", "adapters"},
+    "machine": {"config", "cpu", "env", "vision", "agent", "training", "adapters"},
     "view": {"config", "types", "env", "vision", "training", "report"},
     "commands": {
         "assets",
         "config",
         "types",
+        "cpu",
         "env",
         "vision",
         "agent",

@@ -95,13 +95,15 @@ def wrap_with_fresh_scenes(
     Args:
         env: unbatched.
         episode_length: at most so many decisions; the task's own limit is 100.
-        action_repeat: decisions for which an action is held.
+        action_repeat: 1. brax adds up rewards without a look at ``done``, so that an end would be paid for several
+            times; ``SegvisRover(decision_dt_s=2.0)`` holds an action longer.
         randomization_fn: not used by this environment: conditions are drawn with the scene
             (``SegvisRover(randomize=True)``).
 
     Raises:
-        ConfigError: for a ``randomization_fn``.
+        ConfigError: for a ``randomization_fn``, or another ``action_repeat``.
     """
+    require(action_repeat == 1, "action_repeat", action_repeat, "1: say decision_dt_s=2.0 to hold an action longer")
     require(randomization_fn is None, "randomization_fn", randomization_fn, "None: say randomize=True instead")
     return FreshScenesWrapper(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
 

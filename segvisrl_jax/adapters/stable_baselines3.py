@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float32
 from stable_baselines3.common.vec_env import VecEnv
 
 from segvisrl_jax.adapters.gymnasium import ActionArray, LunarRoverVector, ObservationArray
+from segvisrl_jax.config import require
 
 Indices = int | Iterable[int] | None
 
@@ -79,6 +80,14 @@ class LunarRoverVecEnv(VecEnv):
 
     def close(self) -> None:
         """Nothing is held open."""
+
+    def set_options(self, options: Any = None) -> None:
+        """Refused: a vector of environments has none.
+
+        Raises:
+            ConfigError: for options.
+        """
+        require(not options, "options", options, "empty: a vector of environments has none")
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
         """An attribute of the vector, once for each rover."""

@@ -28,10 +28,6 @@ class DiagonalGaussian:
         noise = shard.of(jax.random.normal(key, (shard.count * rows, *rest), self.mean.dtype))
         return self.mean + self._spread_over_batch(jnp.exp(self.log_std)) * noise
 
-    def mode(self) -> Float32[Array, "*B A"]:
-        """The most probable action."""
-        return self.mean
-
     def log_prob(self, action: Float32[Array, "*B A"]) -> Float32[Array, "*B"]:
         """Log-density of an action, summed over its components."""
         log_std = self._spread_over_batch(self.log_std)

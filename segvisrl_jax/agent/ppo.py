@@ -10,7 +10,6 @@ The loss is in loss.py; acting is not here (training/rollout.py).
 import dataclasses
 import functools
 import math
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -38,6 +37,7 @@ from segvisrl_jax.agent.loss import (
 from segvisrl_jax.agent.networks import Key, Network, Params
 from segvisrl_jax.agent.shard import WHOLE, Shard
 from segvisrl_jax.config import PPOConfig, require
+from segvisrl_jax.cpu import num_cores
 
 Execution = Literal["auto", "host", "fused"]
 Metrics = dict[str, Float32[Array, ""]]
@@ -328,9 +328,11 @@ class Learner:
     @functools.partial(jax.jit, static_argnums=0)
     def _finish(self, progress: Progress, explained_variance: Float32[Array, ""]) -> tuple[LearnerState, Metrics]:
         before = progress.state
+        next_share = self._next_rate_share(before.rate_share, progress.last_kl)
         state = dataclasses.replace(
             before,
-            rate_share=self._next_rate_share(before.rate_share, progress.last_kl),
+            # Where every step was skipped, nothing is known of how far a step goes.
+            rate_share=jnp.where(progress.num_applied > 0, next_share, before.rate_share),
             num_updates=before.num_updates + 1,
         )
         count = jnp.maximum(progress.num_applied, 1).astype(jnp.float32)
@@ -392,11 +394,6 @@ def make_learner(
     )
     piece = max(1, PIECE_PIXELS // _pixels(network))
     return Learner(network, config, schedule, optimizer, kind, chunk, piece, draw, shard)
-
-
-def num_cores() -> int:
-    """CPU cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _per_minibatch(config: PPOConfig, shard: Shard) -> int:

@@ -4,7 +4,7 @@ Units are in the names. A wrong value raises ``ConfigError`` with one line: the 
 Nothing here depends on JAX or MuJoCo.
 """
 
-from segvisrl_jax.config.checks import ConfigError, is_finite, is_plain_text, read_json, require
+from segvisrl_jax.config.checks import ConfigError, is_finite, is_plain_text, one_line, read_json, require
 from segvisrl_jax.config.conditions import ConditionsConfig
 from segvisrl_jax.config.environment import CameraConfig, EnvConfig, PhysicsConfig, SceneConfig, TaskConfig
 from segvisrl_jax.config.learning import EvaluationConfig, NetworkConfig, PPOConfig, TrainConfig
@@ -46,6 +46,7 @@ __all__ = [
     "from_dict",
     "is_finite",
     "is_plain_text",
+    "one_line",
     "preset_config",
     "read_json",
     "replace_fields",

@@ -8,6 +8,7 @@ from segvisrl_jax.config.conditions import NEUTRAL, SCANLINE_ONLY, ConditionsCon
 from segvisrl_jax.config.names import EngineName, ObservationKind, RendererName
 
 LARGEST_M = 1e4  # ten times the largest map: what is meant to be without a limit
+LEAST_RING_M = 0.01  # width of the ring in which goals lie: a narrower one is hardly ever hit
 LARGEST_REWARD = 10**6  # squared, and summed over a batch, it is still far from what a float32 can hold
 
 
@@ -26,10 +27,11 @@ class SceneConfig:
     goal_distance_max_m: float = 16.0
     """... and at most this far (ours: at 0.16 m/s, 100 s cover 16 m)."""
     num_rocks: int = 4
-    """Rocks on the map (paper: 4)."""
+    """Rocks on the map (paper: 4). Said to `segvisrl train`, it takes the place of a preset's random_num_rocks_max and
+    evaluation.rocks."""
     random_num_rocks_max: int = 0
     """Above 0: each training scene has a uniformly random number of rocks from 0 to this, in place of num_rocks (ours;
-    held-out scenes always have num_rocks)."""
+    test scenes have num_rocks, validation scenes evaluation.rocks where that is set)."""
     rock_start_clearance_m: float = 4.0
     """Least distance of a rock's centre from the start (paper)."""
     rock_goal_clearance_m: float = 1.75
@@ -67,8 +69,8 @@ class SceneConfig:
         require(0 <= share <= 1, f"{p}.random_start_yaw_share", share, "in [0, 1]")
         low, high = self.goal_distance_min_m, self.goal_distance_max_m
         require(low > 0, f"{p}.goal_distance_min_m", low, "positive")
-        should = f"more than goal_distance_min_m = {low}, and at most {LARGEST_M:g} metres"
-        require(low < high <= LARGEST_M, f"{p}.goal_distance_max_m", high, should)
+        should = f"at least {LEAST_RING_M} more than goal_distance_min_m = {low}, and at most {LARGEST_M:g} metres"
+        require(low + LEAST_RING_M <= high <= LARGEST_M, f"{p}.goal_distance_max_m", high, should)
         reach = math.hypot(self.map_size_m - self.start_inset_m, half)
         require(
             low < 0.98 * reach, f"{p}.goal_distance_min_m", low, f"below {0.98 * reach:.2f}, so that it fits the map"
@@ -230,7 +232,7 @@ class EnvConfig:
     state_and_rocks: a vector that holds the nearest rocks too."""
     renderer: RendererName = "auto"
     """scanline: in the compiled program; gl: MuJoCo's own renderer, behind a callback; warp: MuJoCo Warp's ray caster,
-    a call out of the program, needs segvisrl_jax[warp]; auto: scanline where it can."""
+    a call out of the program, needs segvisrl_jax[warp]; auto: scanline."""
     scene: SceneConfig = field(default_factory=SceneConfig)
     task: TaskConfig = field(default_factory=TaskConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)

@@ -153,7 +153,7 @@ class TrainConfig:
     """cnn_lstm, cnn: segmented images, with and without memory; cnn_lstm_raw: colour images; mlp: the true state;
     mlp_rocks: the true state and the nearest rocks."""
     preset: PresetName = "cpu"
-    """Where the defaults came from."""
+    """Where the defaults come from: auto, if not said, is gpu where JAX has an accelerator, else cpu."""
     seed: int = 0
     steps: int = 327_680
     """Training decisions in all (rounded up to whole updates)."""
@@ -166,7 +166,8 @@ class TrainConfig:
     start_from: str = ""
     """A policy's folder, or a shipped policy's name: training starts from its weights. Empty: from random ones."""
     num_seeds: int = 1
-    """Runs that are trained at once, in one program: with seed, seed + 1, ..., each in a folder of its own."""
+    """Runs that are trained at once, with seed, seed + 1, ..., each in a folder of its own: in one program, or in turn
+    where policies that look are trained on a CPU."""
     num_devices: int = 1
     """Devices (of each process) that share the environments; the result is that of one, up to the order of sums."""
     coordinator: str = ""

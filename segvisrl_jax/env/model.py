@@ -11,24 +11,10 @@ from jaxtyping import Float
 
 from segvisrl_jax.assets import asset_dir
 from segvisrl_jax.config import CameraConfig, EnvConfig, PhysicsConfig, SceneConfig
-from segvisrl_jax.env.pose import CAMERA_NAME, CameraMount, camera_mount, camera_pose, up_z, yaw_rad
+from segvisrl_jax.env.pose import CAMERA_NAME
 from segvisrl_jax.env.rocks import goal_beacon, rock_library
 from segvisrl_jax.env.scene import sun_direction
 from segvisrl_jax.types import ConvexSolids, PhysicsState, Scene
-
-__all__ = [
-    "CAMERA_NAME",
-    "WHEEL_NAMES",
-    "CameraMount",
-    "build_model",
-    "build_physics_model",
-    "camera_mount",
-    "camera_pose",
-    "set_mujoco_state",
-    "up_z",
-    "wheel_radius_m",
-    "yaw_rad",
-]
 
 WHEEL_NAMES = ("front_left", "front_right", "rear_left", "rear_right")
 """Order of the wheel joints in qpos and qvel, and of the actuators."""

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float32, PRNGKeyArray
 from segvisrl_jax.config import SceneConfig
 from segvisrl_jax.types import ConvexSolids, Scene
 
-FAR_AWAY_M = 1e4  # where a rock stands that has not been placed, or not yet: it keeps nothing clear
+FAR_AWAY_M = 1e4  # where a rock stands that is not there, or not yet: it keeps nothing clear
 
 
 def sample_scene(key: PRNGKeyArray, config: SceneConfig, rocks: ConvexSolids) -> Scene:

@@ -9,6 +9,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 
 from segvisrl_jax.config import SceneConfig, TaskConfig
+from segvisrl_jax.env.scene import FAR_AWAY_M
 from segvisrl_jax.types import Outcome, RewardTerms, Scene
 
 
@@ -86,7 +87,8 @@ def outcome_at_instants(track: Track, scene: Scene, task: TaskConfig, rules: Sce
 def rock_clearance_m(xy_m: Float32[Array, "J 2"], scene: Scene) -> Float32[Array, "J"]:
     """Distance from each place to the nearest rock's centre; inf without rocks."""
     distance = jnp.linalg.norm(xy_m[:, None] - scene.rock_xy_m[None], axis=-1)
-    return jnp.min(distance, axis=-1, initial=jnp.inf)
+    is_there = scene.rock_xy_m[:, 0] < FAR_AWAY_M / 2
+    return jnp.min(distance, axis=-1, initial=jnp.inf, where=is_there)
 
 
 def _reward_terms(

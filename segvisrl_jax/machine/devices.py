@@ -8,7 +8,8 @@ import subprocess
 from collections.abc import Iterator
 from typing import Any
 
-from segvisrl_jax.machine.finding import GIB, Finding, one_line
+from segvisrl_jax.config import one_line
+from segvisrl_jax.machine.finding import GIB, Finding
 
 SECTION = "devices"
 ASK_TIMEOUT_S = 20.0
@@ -35,7 +36,7 @@ def look() -> Iterator[Finding]:
 def _jax_devices() -> list[Any] | str:
     """The devices, or why there are none. Starts JAX as training does."""
     with contextlib.suppress(Exception):  # MuJoCo cannot be imported: ``installed`` has said so
-        from segvisrl_jax.env.physics.native import make_callbacks_safe
+        from segvisrl_jax.cpu import make_callbacks_safe
 
         make_callbacks_safe()  # before JAX's backends start
     try:

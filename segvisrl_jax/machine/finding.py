@@ -25,8 +25,3 @@ class Finding:
             raise ValueError(f"{self.name}: a problem needs a remedy")
         if self.stops_training and self.mark != "problem":
             raise ValueError(f"{self.name}: what stops training is a problem")
-
-
-def one_line(error: BaseException) -> str:
-    """What an error says, in one line of bounded length."""
-    return " ".join(str(error).split())[:300] or type(error).__name__

@@ -8,7 +8,8 @@ from importlib.metadata import PackageNotFoundError, requires, version
 
 from packaging.requirements import Requirement
 
-from segvisrl_jax.machine.finding import Finding, one_line
+from segvisrl_jax.config import one_line
+from segvisrl_jax.machine.finding import Finding
 
 SECTION = "versions"
 PACKAGE = "segvisrl_jax"

@@ -13,7 +13,8 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from segvisrl_jax.machine.finding import Finding, one_line
+from segvisrl_jax.config import one_line
+from segvisrl_jax.machine.finding import Finding
 
 HEADLESS = ("egl", "osmesa")
 VARIABLE = "MUJOCO_GL"

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from segvisrl_jax.agent.loss import make_batch
-from segvisrl_jax.agent.ppo import num_cores
 from segvisrl_jax.config import IMAGE_OBSERVATIONS, EnvConfig, TrainConfig, replace_fields
+from segvisrl_jax.cpu import num_cores
 from segvisrl_jax.env.rover_env import RoverEnv, observation_shape
 from segvisrl_jax.env.wrappers import BatchEnv
 from segvisrl_jax.machine.limits import flop_of, time_calls

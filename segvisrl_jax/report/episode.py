@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 
-from segvisrl_jax.config import ObservationKind, replace_fields
-from segvisrl_jax.env.pose import camera_mount, camera_pose, yaw_rad
+from segvisrl_jax.config import ConditionsConfig, ObservationKind, replace_fields
+from segvisrl_jax.env.pose import yaw_rad
 from segvisrl_jax.env.rover_env import RoverEnv
 from segvisrl_jax.env.wrappers import select
 from segvisrl_jax.report import layout
@@ -60,7 +60,7 @@ class Episode:
         return np.asarray(self.states.physics.qpos[:, :2])
 
 
-def drive_episode(env: RoverEnv, policy: Policy, params: Any, stream: PRNGKeyArray, episode: int = 0) -> Episode:
+def drive_episode(env: RoverEnv, policy: Policy, params: Any, stream: PRNGKeyArray, episode: int) -> Episode:
     """Drives one numbered scene of a stream to its end: the same one as ``Evaluator.run`` with that number.
 
     Keeps what the policy saw.
@@ -193,17 +193,24 @@ def scene_map(env: RoverEnv, scene: Scene) -> SceneMap:
 
 
 def camera_view(env: RoverEnv, kind: ObservationKind) -> Callable[[RoverState], UInt8[Array, "H W 3"]]:
-    """A jitted function from a state to the whole camera image, (360, 640, 3) uint8, in colour or segmented."""
-    config = replace_fields(env.config, obs=kind, width_px=VIEW_WIDTH_PX, height_px=VIEW_HEIGHT_PX, scale=1.0)
-    camera = config.camera
-    renderer = make_renderer(config, np.arange(camera.height_px), np.arange(camera.width_px))
-    mount = camera_mount(env.mj_model)
+    """A jitted function from a state to the whole camera image, (360, 640, 3) uint8, in colour or segmented.
+
+    Under the scene's own conditions, but for those that are drawn for each frame anew.
+    """
+    size = {"width_px": VIEW_WIDTH_PX, "height_px": VIEW_HEIGHT_PX, "scale": 1.0}
+    # Neutral conditions ask nothing of renderer or rocks that this image does not need.
+    config = replace_fields(env.config, obs=kind, conditions=ConditionsConfig(), **size)
+    renderer = make_renderer(config, np.arange(VIEW_HEIGHT_PX), np.arange(VIEW_WIDTH_PX))
+    smaller = VIEW_WIDTH_PX / env.config.camera.width_px
 
     def draw(rover: RoverState) -> UInt8[Array, "H W 3"]:
-        pose = camera_pose(rover.physics, mount)
-        if config.obs == "rgb":
-            return renderer.rgb(rover.scene, pose)
-        return jnp.asarray(PALETTE)[renderer.classes(rover.scene, pose)]
+        camera = env.camera(rover)
+        if kind == "rgb":
+            return renderer.rgb(rover.scene, camera)
+        border = rover.scene.conditions.border_px
+        of_view = None if border is None else smaller * border
+        conditions = dataclasses.replace(rover.scene.conditions, border_px=of_view)
+        return jnp.asarray(PALETTE)[renderer.classes(dataclasses.replace(rover.scene, conditions=conditions), camera)]
 
     return jax.jit(draw)
 

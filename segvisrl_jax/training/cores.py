@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from segvisrl_jax.agent.convolution import largest_divisor
-from segvisrl_jax.agent.ppo import num_cores
 from segvisrl_jax.agent.shard import Shard
+from segvisrl_jax.cpu import num_cores
 from segvisrl_jax.training.devices import AXIS
 
 

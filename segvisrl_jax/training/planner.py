@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32
 
 from segvisrl_jax.config import EnvConfig
-from segvisrl_jax.env.physics.native import make_callbacks_safe
+from segvisrl_jax.cpu import make_callbacks_safe
 from segvisrl_jax.env.pose import in_rover_frame, yaw_rad
 from segvisrl_jax.training.policy import Policy
 from segvisrl_jax.training.shortest_path import shortest_path
@@ -35,7 +35,7 @@ def planner(config: EnvConfig | None = None) -> Policy:
     """The planner for scenes under these rules (None: the paper's); its carry is a path for every rover, (B, K, 2).
 
     Where there is no path with the widest margin, it tries narrower ones, and drives straight at the goal where
-    there is none at all. On a CPU, ask for it before the first array is made (``native.make_callbacks_safe``).
+    there is none at all. On a CPU, ask for it before the first array is made (``cpu.make_callbacks_safe``).
     """
     make_callbacks_safe()
     plan = functools.partial(_plan_where, config or EnvConfig())

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float32, PRNGKeyArray
 
 from segvisrl_jax.agent.networks import Network
+from segvisrl_jax.config import EnvConfig
 from segvisrl_jax.env.pose import yaw_rad
 from segvisrl_jax.types import Action, Observation, RoverState
 
@@ -60,15 +61,19 @@ def random_controller() -> Policy:
     return Policy("random", observes=False, initial_carry=lambda num_envs: (), act=act)
 
 
-def planner() -> Policy:
+def planner(world: EnvConfig) -> Policy:
     """The privileged planner (``planner.planner``, which builds on this file: imported when asked for)."""
     from segvisrl_jax.training import planner
 
-    return planner.planner()
+    return planner.planner(world)
 
 
-CONTROLLERS: dict[str, Callable[[], Policy]] = {"p": p_controller, "random": random_controller, "planner": planner}
-"""By the names that the command line takes."""
+CONTROLLERS: dict[str, Callable[[EnvConfig], Policy]] = {
+    "p": lambda world: p_controller(),
+    "random": lambda world: random_controller(),
+    "planner": planner,
+}
+"""By the names that the command line takes, for the world in which they drive."""
 
 
 def network_policy(network: Network, name: str) -> Policy:

@@ -30,3 +30,9 @@ PALETTE = np.array(
     np.uint8,
 )
 """(4, 3) uint8, in class order. The colours are ours; the paper does not print its palette."""
+
+
+def class_of_geom(name: str) -> SegmentationClass:
+    """The class of a geom by its name, or space for what the camera must not see."""
+    kinds = (kind for prefix, kind in GEOM_PREFIXES.items() if name.startswith(prefix))
+    return next(kinds, SegmentationClass.SPACE)

@@ -37,7 +37,7 @@ def developed(
     """The camera's image as it is exposed, with noise, saturated; left as it is where neither is configured.
 
     Returns:
-        Levels in [0, 255], as floats: rounding comes after shrinking.
+        Levels in [0, 255], as floats, since rounding comes after shrinking; the image itself where neither is.
     """
     exposure, noise = conditions.exposure, conditions.sensor_noise_levels
     if exposure is None and noise is None:

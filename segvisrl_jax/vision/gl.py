@@ -14,11 +14,13 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
-from segvisrl_jax.config import EnvConfig, require
+from segvisrl_jax.config import EnvConfig
+from segvisrl_jax.cpu import make_callbacks_safe
 from segvisrl_jax.env.model import CAMERA_NAME, SHADOW_AHEAD_M, SUN_DISTANCE_M, build_model
 from segvisrl_jax.types import CameraPose, Scene
-from segvisrl_jax.vision.classes import GEOM_PREFIXES
+from segvisrl_jax.vision.classes import class_of_geom
 from segvisrl_jax.vision.gl_context import GlThread, open_draw_context
+from segvisrl_jax.vision.renderer import require_lines
 
 CHANNELS = 3  # red, green, blue
 SHOWN_GROUP, HIDDEN_GROUP = 0, 5  # geom groups; the rover and unused rocks are not shown
@@ -58,10 +60,10 @@ class GlRenderer:
         Raises:
             ConfigError: where a row or a column is not in the source image.
         """
-        jax.config.update("jax_cpu_enable_async_dispatch", False)
+        make_callbacks_safe()
         height, width = config.camera.height_px, config.camera.width_px
-        _require_inside(rows, height, "rows")
-        _require_inside(columns, width, "columns")
+        require_lines(rows, height, "rows")
+        require_lines(columns, width, "columns")
         self._config = config
         self._size = (len(rows), len(columns))
         upwards = height - 1 - np.asarray(rows, np.int64)  # OpenGL's lowest row comes first
@@ -148,7 +150,7 @@ class Canvas:
     def __init__(self, config: EnvConfig) -> None:
         model = build_model(config)
         names = [model.geom(geom).name for geom in range(model.ngeom)]
-        self._class_of_geom = np.array([_class_of(name) for name in names])
+        self._class_of_geom = np.array([int(class_of_geom(name)) for name in names])
         self._rocks = np.array([names.index(f"rock{i}") for i in range(config.scene.num_rock_shapes)])
         self._goal = names.index("goal")
         model.geom_group[:] = np.where(self._class_of_geom > 0, SHOWN_GROUP, HIDDEN_GROUP)
@@ -245,20 +247,3 @@ class Canvas:
         mujoco.mjr_render(self._view, self._scene, self._drawing)
         mujoco.mjr_readPixels(self._image, None, self._view, self._drawing)
         return self._image
-
-
-def _class_of(geom_name: str) -> int:
-    """The class of a geom by its name, or 0 for what the camera must not see."""
-    for prefix, segmentation_class in GEOM_PREFIXES.items():
-        if geom_name.startswith(prefix):
-            return int(segmentation_class)
-    return 0
-
-
-def _require_inside(indices: Int[np.ndarray, "n"], size: int, name: str) -> None:
-    """Every index is a pixel of the source image."""
-    given = np.asarray(indices)
-    is_list = given.ndim == 1 and given.size > 0 and np.issubdtype(given.dtype, np.integer)
-    require(is_list, name, indices, "a list of one or more whole numbers")
-    low, high = int(given.min()), int(given.max())
-    require(low >= 0 and high < size, name, (low, high), f"from 0 to {size - 1}, the source image")

@@ -18,7 +18,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import mujoco
 
-from segvisrl_jax.config import ConfigError
+from segvisrl_jax.config import ConfigError, one_line
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -62,7 +62,7 @@ def open_gl_context(width_px: int, height_px: int) -> Any:
         try:
             return _open(module, width_px, height_px)
         except Exception as error:  # PyOpenGL and the loaders raise errors of many types
-            reasons.append(f"{module}: {_one_line(error)}")
+            reasons.append(f"{module}: {one_line(error)}")
     raise ConfigError(f"OpenGL cannot be opened ({'; '.join(reasons)}): {INSTALL}, {WITHOUT}")
 
 
@@ -115,10 +115,6 @@ def _require_osmesa() -> None:
             ctypes.CDLL(name)
             return
     raise OSError(f"cannot load {OSMESA_LIBRARIES[0]}")
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 class GlThread:
@@ -196,6 +192,6 @@ def open_draw_context(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, drawing)
     except mujoco.FatalError as error:
         context.free()
-        reason = f"OpenGL cannot draw {size[0]} x {size[1]} pixels ({_one_line(error)})"
+        reason = f"OpenGL cannot draw {size[0]} x {size[1]} pixels ({one_line(error)})"
         raise ConfigError(f"{reason}: {INSTALL}, {WITHOUT}") from error
     return context, drawing

@@ -24,7 +24,6 @@ from segvisrl_jax.types import CameraPose
 from segvisrl_jax.vision.polyhedra import Polyhedra
 
 NO_CROSSING_PX = 1e9  # where a span starts, and minus where it ends, in a row without a crossing
-MUJOCO_MAX_SQUARES = 198  # mjMAXPLANEGRID, less its border
 VERTEX_GRID_PX = 1 / 256  # rasterisers move the ends of edges to a grid this fine
 TINY_SLOPE = 1e-30  # stands in for 0 where a bound is level: all of the row is inside, or nothing
 LEAST_DIVISOR = 1e-6  # a camera that looks straight up or down has no horizon
@@ -169,7 +168,7 @@ def shadow(
     on_ground = (solid.vertices_m - reach * sun) * jnp.array([1.0, 1.0, 0.0], jnp.float32)
     points = rotate(camera_axes(camera), rotate(stand.turn, on_ground) + stand.from_camera_m)
     is_outline = _is_outline(solid, rotate(solid.normals, sun) > 0.0)
-    sides, is_side = _flat_polygon(points, solid.edges, is_outline, projection, 0.0)
+    sides, is_side = _flat_polygon(points, solid.edges, is_outline, projection)
     return _sides(*_compact(sides, is_side, max_sides(solid)))
 
 
@@ -272,7 +271,6 @@ def _clip(
     points_m: Float32[Array, "V 3"],
     edges: Int32[Array, "E 2"] | Int32[np.ndarray, "E 2"],
     projection: Projection,
-    far_shift_v_px: Float32[Array, ""] | float = 0.0,
 ) -> tuple[Float32[Array, "E 2 2"], Bool[Array, "E"], _Cuts]:
     """(ends of each edge in the image after clipping, whether anything is left of it, where it was cut).
 
@@ -282,7 +280,6 @@ def _clip(
     depth = ends[..., 2]
     near, is_near = _intersect(ends, projection.near_m, projection)
     far, is_far = _intersect(ends, projection.far_m, projection)
-    far = far.at[:, 1].add(far_shift_v_px)
     # As rasterisers do: else upright edges of the goal are off by a pixel where they pass close by pixel centres.
     image = jnp.round(projection.to_image(points_m) / VERTEX_GRID_PX) * VERTEX_GRID_PX
     image = image[edges]
@@ -318,10 +315,9 @@ def _flat_polygon(
     edges: Int32[Array, "E 2"] | Int32[np.ndarray, "E 2"],
     is_outline: Bool[Array, "E"],
     projection: Projection,
-    far_shift_v_px: Float32[Array, ""] | float,
 ) -> tuple[Float32[Array, "K 2 2"], Bool[Array, "K"]]:
     """The sides of one flat convex polygon's image: its clipped edges and the two planes' cuts."""
-    ends, is_left, cuts = _clip(points_m, edges, projection, far_shift_v_px)
+    ends, is_left, cuts = _clip(points_m, edges, projection)
     near_ends, near_cut = _chord(cuts.near[None], (cuts.is_near & is_outline)[None])
     far_ends, far_cut = _chord(cuts.far[None], (cuts.is_far & is_outline)[None])
     is_side = jnp.concatenate([is_left & is_outline, near_cut, far_cut])

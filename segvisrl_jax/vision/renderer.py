@@ -13,8 +13,8 @@ from segvisrl_jax.types import CameraPose, Scene
 class Renderer(Protocol):
     """Draws what the camera sees, at the rows and columns it was built for. Unbatched; jit, scan and vmap over it.
 
-    It is built once from the camera settings, the rock library, the goal's solid, and two increasing-or-repeating
-    lists of source rows and columns (``TapPlan.rows``, ``TapPlan.columns``, or all of them).
+    It is built once from the settings (``EnvConfig``) and two lists of source rows and columns (``TapPlan.rows``,
+    ``TapPlan.columns``, or all of them; ``scanline`` wants them in increasing order).
     """
 
     name: str
@@ -60,3 +60,17 @@ def make_renderer(config: EnvConfig, rows: Int[np.ndarray, "rows"], columns: Int
     from segvisrl_jax.vision.scanline import ScanlineRenderer
 
     return ScanlineRenderer(config, rows, columns)
+
+
+def require_lines(lines: Int[np.ndarray, "n"], size: int, name: str, in_order: bool = False) -> None:
+    """Rows or columns of a source image that has ``size`` of them.
+
+    Raises:
+        ConfigError: where they are not that, or not in increasing order where that is asked for.
+    """
+    given = np.asarray(lines)
+    good = given.ndim == 1 and given.size > 0 and np.issubdtype(given.dtype, np.integer)
+    good = good and bool(given.min() >= 0) and bool(given.max() < size)
+    good = good and not (in_order and np.any(np.diff(given) < 0))
+    order = ", in increasing order" if in_order else ""
+    require(good, name, lines, f"a list of one or more whole numbers from 0 to {size - 1}, the source image{order}")

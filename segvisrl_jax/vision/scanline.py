@@ -20,7 +20,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Int, Int32, UInt8
 
-from segvisrl_jax.config import EnvConfig, require
+from segvisrl_jax.config import EnvConfig
 from segvisrl_jax.env.rocks import concatenate_solids, goal_beacon, rock_library
 from segvisrl_jax.types import CameraPose, Conditions, Scene
 from segvisrl_jax.vision.batching import by_platform, one_by_one_on_cpu
@@ -47,6 +47,7 @@ from segvisrl_jax.vision.projection import (
     silhouette,
     spans,
 )
+from segvisrl_jax.vision.renderer import require_lines
 from segvisrl_jax.vision.shading import Faces, Surfaces, face_light, faces, ground_light
 
 SPACE, GROUND, ROCK, GOAL = (np.uint8(kind) for kind in SegmentationClass)
@@ -97,8 +98,8 @@ class ScanlineRenderer:
         Raises:
             ConfigError: where a row or a column is not in the source image, or out of order.
         """
-        _require_lines(rows, config.camera.height_px, "rows")
-        _require_lines(columns, config.camera.width_px, "columns")
+        require_lines(rows, config.camera.height_px, "rows", in_order=True)
+        require_lines(columns, config.camera.width_px, "columns", in_order=True)
         self._rows, self._columns = np.asarray(rows), np.asarray(columns)
         self._projection = Projection.from_config(config.camera)
         self._map_size_m = config.scene.map_size_m
@@ -293,12 +294,3 @@ def _places(scene: Scene, goal_shape: int) -> tuple[Array, Array, Array]:
 def _take(arrays: Any, number: int | Array) -> Any:
     """One of several, from a pytree with a leading axis."""
     return jax.tree.map(lambda array: array[number], arrays)
-
-
-def _require_lines(lines: np.ndarray, size: int, name: str) -> None:
-    lines = np.asarray(lines)
-    good = lines.ndim == 1 and lines.size > 0 and np.issubdtype(lines.dtype, np.integer)
-    good = good and bool(lines.min() >= 0) and bool(lines.max() < size)
-    good = good and bool(np.all(np.diff(lines) >= 0))
-    should = f"one list of whole numbers in [0, {size}), in increasing order"
-    require(good, name, lines, should)

@@ -16,8 +16,9 @@ from jaxtyping import Array, Float32, Int, Int32, UInt8
 from segvisrl_jax.config import EnvConfig, require
 from segvisrl_jax.env.model import build_model
 from segvisrl_jax.types import CameraPose, Scene
-from segvisrl_jax.vision.classes import GEOM_PREFIXES, SegmentationClass
+from segvisrl_jax.vision.classes import SegmentationClass, class_of_geom
 from segvisrl_jax.vision.projection import Projection
+from segvisrl_jax.vision.renderer import require_lines
 from segvisrl_jax.vision.warp_stage import NOTHING_HIT, Stage, World
 
 RGB_SHIFTS = np.array([16, 8, 0], np.uint32)  # where Warp packs red, green and blue in a pixel's 32 bits
@@ -53,8 +54,8 @@ class WarpRenderer:
             ConfigError: where a row or a column is not in the source image, or JAX runs on what Warp does not.
         """
         require(jax.default_backend() in ("cpu", "gpu"), "env.renderer", self.name, "'scanline' on this device")
-        _require_inside(rows, config.camera.height_px, "rows")
-        _require_inside(columns, config.camera.width_px, "columns")
+        require_lines(rows, config.camera.height_px, "rows")
+        require_lines(columns, config.camera.width_px, "columns")
         projection = Projection.from_config(config.camera)
         model = build_model(config)
         model.vis.map.zfar = projection.far_m  # world.xml sets the extent so that this is in metres
@@ -63,7 +64,7 @@ class WarpRenderer:
         stage = Stage(model, _rays(projection, rows, columns), self._size)
         self._hits, self._colours = _batched(stage.hits), _batched(stage.colours)
         names = [model.geom(geom).name for geom in range(model.ngeom)]
-        self._class_of_geom = np.array([_class_of(name) for name in names], np.uint8)
+        self._class_of_geom = np.array([class_of_geom(name) for name in names], np.uint8)
 
     def classes(self, scene: Scene, camera: CameraPose) -> UInt8[Array, "rows columns"]:
         """Class ids (``vision.classes``) at every wanted row and column."""
@@ -163,17 +164,3 @@ def _rays(
 def _turn_about_z(yaw_rad: Float32[Array, ""]) -> Float32[Array, "3 3"]:
     cos, sin = jnp.cos(yaw_rad), jnp.sin(yaw_rad)
     return jnp.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _class_of(geom_name: str) -> SegmentationClass:
-    """The class of a geom by its name, or space for what the camera must not see."""
-    kinds = (kind for prefix, kind in GEOM_PREFIXES.items() if geom_name.startswith(prefix))
-    return next(kinds, SegmentationClass.SPACE)
-
-
-def _require_inside(indices: Int[np.ndarray, "n"], size: int, name: str) -> None:
-    """Every index is a pixel of the source image."""
-    given = np.asarray(indices)
-    is_list = given.ndim == 1 and given.size > 0 and np.issubdtype(given.dtype, np.integer)
-    is_inside = is_list and bool(given.min() >= 0) and bool(given.max() < size)
-    require(is_inside, name, indices, f"a list of one or more whole numbers from 0 to {size - 1}, the source image")

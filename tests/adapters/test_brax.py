@@ -53,6 +53,14 @@ def test_what_wrappers_do_after_an_episode(wrap, is_fresh):
     assert len({goal.tobytes() for goal in seen}) == (4 if is_fresh else 1)
 
 
+def test_what_it_cannot_do_is_refused():
+    env = brax.envs.get_environment(BRAX_NAME, obs="state")
+    with pytest.raises(ConfigError, match=r"action_repeat = 2: should be 1: say decision_dt_s"):
+        wrap_with_fresh_scenes(env, episode_length=100, action_repeat=2)
+    with pytest.raises(ConfigError, match=r"randomization_fn = .*: should be None"):
+        wrap_with_fresh_scenes(env, episode_length=100, randomization_fn=print)
+
+
 def test_only_the_scene_of_a_finished_episode_changes():
     env = wrap_with_fresh_scenes(brax.envs.get_environment(BRAX_NAME, obs="state", num_rocks=32), episode_length=100)
     state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), 8))

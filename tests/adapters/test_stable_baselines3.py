@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from segvisrl_jax import GYMNASIUM_ID
+from segvisrl_jax import GYMNASIUM_ID, ConfigError
 
 pytest.importorskip("stable_baselines3", reason="needs the extra [sb3]: make sb3")
 pytest.importorskip("sb3_contrib", reason="needs the extra [sb3]: make sb3")
@@ -59,6 +59,11 @@ def test_ends_are_told_as_it_wants_them():
 
 
 @pytest.mark.slow
+def test_options_are_refused_as_there_are_none():
+    with pytest.raises(ConfigError, match=r"options = \{'scene': 3\}: should be empty"):
+        LunarRoverVecEnv(2, obs="state").set_options({"scene": 3})
+
+
 def test_its_evaluation_drives_whole_episodes():
     envs = VecMonitor(LunarRoverVecEnv(4, obs="state", max_decisions=5))
     returns, lengths = evaluate_policy(

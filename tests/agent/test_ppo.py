@@ -259,6 +259,9 @@ def test_rate_falls_while_updates_move_the_policy_too_far_and_comes_back(executi
         slowest, _ = update(rises, slowest, trajectory)
         shares.append(slowest.rate_share)
     np.testing.assert_allclose(shares, [1 / 1.25**2, 1 / 1.25, 1, 1], rtol=1e-6)
+    broken = dataclasses.replace(trajectory, log_prob=trajectory.log_prob * jnp.nan)
+    kept, _ = update(rises, slower, broken)  # every step is skipped
+    np.testing.assert_array_equal(kept.rate_share, slower.rate_share)
 
 
 @pytest.mark.parametrize("execution", ["host", "fused"])

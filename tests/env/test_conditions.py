@@ -448,7 +448,7 @@ def test_randomised_scenes_differ_within_their_ranges_and_are_the_same_scenes(ob
         low, high = RANDOM_RANGES[name]
         assert np.all((np.asarray(values) >= low) & (np.asarray(values) <= high)), name
         assert np.mean(values) == pytest.approx((low + high) / 2, abs=0.12 * (high - low)), name
-        assert len(np.unique(values)) >= 2 if name == "num_ghost_rocks" else 295
+        assert len(np.unique(values)) >= (2 if name == "num_ghost_rocks" else 295), name
     several = np.corrcoef(np.stack([np.asarray(values, float) for values in held.values()]))
     assert np.abs(several - np.eye(len(held))).max() < 0.25  # each for itself
     sun = np.asarray(rovers.scene.sun_direction)

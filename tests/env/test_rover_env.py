@@ -1,5 +1,6 @@
 """The environment keeps brax's contract, compiles once, resets onto fresh scenes, and shows MuJoCo its state."""
 
+import dataclasses
 import functools
 
 import cv2
@@ -89,7 +90,7 @@ def test_driving_straight_at_the_goal_succeeds_and_pays_what_it_covers():
     assert float(state.pipeline_state.path_length_m) == pytest.approx(12.0 - left, abs=0.01)
 
 
-def test_automatic_reset_draws_a_fresh_scene_and_leaves_the_others_alone():
+def test_automatic_reset_draws_a_fresh_scene_for_every_episode():
     env = make("state", max_decisions=3)
     batch = BatchEnv(env, 4)
     state = jax.jit(batch.reset)(jax.random.key(4))
@@ -104,6 +105,23 @@ def test_automatic_reset_draws_a_fresh_scene_and_leaves_the_others_alone():
     assert np.array_equal(goals[0], goals[2])
     assert len({tuple(g) for at in (0, 3, 6) for g in goals[at].tolist()}) == 12
     assert np.all(np.asarray(state.rover.num_decisions) == 0)
+
+
+def test_automatic_reset_leaves_the_others_alone():
+    """The second of three rovers is at its limit; without rocks or a goal in reach nothing else ends."""
+    batch = BatchEnv(make("state", num_rocks=0, max_decisions=50), 3)
+    state = jax.jit(batch.reset)(jax.random.key(4))
+    rover = state.rover.replace(num_decisions=jnp.array([7, 49, 0], jnp.int32))
+    after, result = jax.jit(batch.step)(dataclasses.replace(state, rover=rover), jnp.full((3, 2), 0.5))
+    np.testing.assert_array_equal(after.is_first, [0, 1, 0])
+    np.testing.assert_array_equal(after.rover.num_decisions, [8, 0, 1])
+    for was, now in (
+        (state.rover.scene.goal_xy_m, after.rover.scene.goal_xy_m),
+        map(jax.random.key_data, (state.key, after.key)),
+    ):
+        np.testing.assert_array_equal(np.any(np.asarray(was) != np.asarray(now), axis=1), [False, True, False])
+    moved = jax.tree.map(lambda one: np.asarray(one)[::2], (after.rover, result.rover))
+    jax.tree.map(np.testing.assert_array_equal, *moved)
 
 
 def test_truncation_is_told_apart_from_termination():

@@ -4,11 +4,11 @@ import jax
 import numpy as np
 import pytest
 
-from segvisrl_jax.config import EnvConfig, replace_fields
+from segvisrl_jax.config import ConditionsConfig, EnvConfig, replace_fields
 from segvisrl_jax.env.rover_env import RoverEnv
 from segvisrl_jax.env.wrappers import TEST_STREAM, scene_stream
 from segvisrl_jax.report import episode as module
-from segvisrl_jax.report.episode import drive_episode, drive_episodes
+from segvisrl_jax.report.episode import VIEW_HEIGHT_PX, VIEW_WIDTH_PX, camera_view, drive_episode, drive_episodes
 from segvisrl_jax.training.evaluation import Evaluator
 from segvisrl_jax.training.policy import p_controller
 from segvisrl_jax.types import Outcome
@@ -57,3 +57,28 @@ def test_one_episode_keeps_what_there_was_to_see():
     assert one.observations.shape == (7, *env.observation_shape)
     np.testing.assert_array_equal(one.observations[2], jax.jit(env.observe)(one.state(2)))
     assert np.any(one.observations[0] != one.observations[-1])
+
+
+def seen_from(size, conditions, **settings):
+    """A start under these conditions, from a camera whose picture is so many times as large as the view's."""
+    pixels = {"width_px": size * VIEW_WIDTH_PX, "height_px": size * VIEW_HEIGHT_PX, "scale": 1.0}
+    env = RoverEnv(replace_fields(EnvConfig(), conditions=conditions, **pixels, **settings))
+    return env, env.initial_state(jax.random.key(2))
+
+
+def test_the_view_is_that_of_the_moved_camera_and_the_wrong_segmentation():
+    moved = {"camera_height_offset_m": 0.1, "camera_pitch_offset_deg": 4.0}
+    env, rover = seen_from(1, ConditionsConfig(**moved, border_px=5), num_rocks=16)
+    view = camera_view(env, "segmentation")(rover)
+    np.testing.assert_array_equal(view, env.observe(rover))
+    large, its_rover = seen_from(2, ConditionsConfig(**moved, border_px=10), num_rocks=16)
+    np.testing.assert_array_equal(view, camera_view(large, "segmentation")(its_rover))
+    plain, its_rover = seen_from(1, ConditionsConfig(), num_rocks=16)
+    assert np.mean(view != camera_view(plain, "segmentation")(its_rover)) > 0.01
+
+
+def test_the_view_asks_nothing_of_conditions_that_it_does_not_show():
+    """As many rocks as there are shapes: segmentation under random conditions would have none left for ghosts."""
+    env, rover = seen_from(1, ConditionsConfig(randomize=True), obs="rgb", num_rocks=64)
+    assert camera_view(env, "segmentation")(rover).shape == (VIEW_HEIGHT_PX, VIEW_WIDTH_PX, 3)
+    assert camera_view(env, "rgb")(rover).shape == (VIEW_HEIGHT_PX, VIEW_WIDTH_PX, 3)

@@ -144,7 +144,7 @@ def test_a_path_is_planned_where_an_episode_begins_and_kept_elsewhere(env):
 def test_sixty_scenes_with_sixteen_rocks_all_succeed():
     """In 25 slots, so that episodes begin at different times."""
     env = segvisrl_jax.make_env(obs="state", physics="native", num_rocks=16)
-    policy = CONTROLLERS["planner"]()
+    policy = CONTROLLERS["planner"](EnvConfig())
     assert policy.name == "planner"
     finished = Evaluator(env, policy, 25).run((), scene_stream(5, TEST_STREAM), 60)
     assert np.all(finished.outcome == Outcome.SUCCESS)

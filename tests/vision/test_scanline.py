@@ -13,7 +13,8 @@ import pytest
 from views import EYE_M, HEIGHT, WIDTH, camera_at
 
 from segvisrl_jax.config import ConfigError, EnvConfig, SceneConfig
-from segvisrl_jax.env.model import build_physics_model, camera_mount, camera_pose
+from segvisrl_jax.env.model import build_physics_model
+from segvisrl_jax.env.pose import camera_mount, camera_pose
 from segvisrl_jax.env.rocks import BEACON_RADIUS_M, rock_library
 from segvisrl_jax.env.scene import sample_scene
 from segvisrl_jax.types import CameraPose, PhysicsState, Scene

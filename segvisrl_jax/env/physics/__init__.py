@@ -3,6 +3,7 @@
 import jax
 
 from segvisrl_jax.config import ConfigError, EnvConfig
+from segvisrl_jax.cpu import make_callbacks_safe
 from segvisrl_jax.env.physics.engine import PhysicsEngine
 
 __all__ = ["PhysicsEngine", "make_engine"]
@@ -12,7 +13,7 @@ def make_engine(config: EnvConfig) -> PhysicsEngine:
     """The engine that ``config.physics.engine`` names; auto: mjx on an accelerator, else native.
 
     Build it before any other use of JAX in the process: for the native engine JAX's CPU backend
-    must start in its own way (``native.make_callbacks_safe``).
+    must start in its own way (``cpu.make_callbacks_safe``).
 
     Raises:
         ConfigError: where the engine cannot run here, or there is none of that name.
@@ -20,7 +21,7 @@ def make_engine(config: EnvConfig) -> PhysicsEngine:
     name = config.physics.engine
     if name == "mjx":
         return _make_mjx(config)
-    from segvisrl_jax.env.physics.native import NativeEngine, make_callbacks_safe
+    from segvisrl_jax.env.physics.native import NativeEngine
 
     make_callbacks_safe()  # before the next line starts JAX's backends
     if name == "auto" and jax.default_backend() != "cpu":
@@ -38,5 +39,5 @@ def _make_mjx(config: EnvConfig) -> PhysicsEngine:
     except (ImportError, NotImplementedError) as error:
         reason = next(iter(str(error).splitlines()), type(error).__name__)  # not every error has a text
         raise ConfigError(
-            f"physics.engine = 'mjx': should be 'native' here, because MJX cannot run: {reason}"
+            f"physics.engine = {config.physics.engine!r}: should be 'native' here, because MJX cannot run: {reason}"
         ) from error

@@ -5,7 +5,6 @@ One call a decision moves the whole batch, however many ``vmap``s led to it. Pro
 """
 
 import hashlib
-import os
 import threading
 from functools import partial
 
@@ -18,19 +17,10 @@ from jaxtyping import Array, Float, Float32
 
 from segvisrl_jax import ffi
 from segvisrl_jax.config import ConfigError, EnvConfig
+from segvisrl_jax.cpu import make_callbacks_safe, num_cores
 from segvisrl_jax.env.model import build_physics_model
 from segvisrl_jax.env.physics import engine
 from segvisrl_jax.types import PhysicsState
-
-
-def make_callbacks_safe() -> None:
-    """Makes JAX's CPU backend run programs in the calling thread.
-
-    Otherwise a program that waits for its callback can hold the very threads which the callback's
-    arguments wait for, and hang (jax-ml/jax issues 24219, 25861). JAX reads this once, when its
-    first array is made: call it before that.
-    """
-    jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 
 class NativeEngine:
@@ -50,7 +40,7 @@ class NativeEngine:
         self._rest_height_m = engine.rest_height_m(model)
         self._max_wheel_speed = float(model.actuator_ctrlrange[0, 1])
         self._num_judgements = config.task.num_judgements
-        num_threads = config.physics.num_threads or os.cpu_count() or 1
+        num_threads = config.physics.num_threads or num_cores()
         stride = engine.steps_per_judgement(config)
         self._target, self._mover = _shared_mover(model, stride, self._num_judgements, num_threads)
 

@@ -1,0 +1,20 @@
+"""The CPU: the cores that this process may use, and how JAX runs programs on them."""
+
+import os
+
+import jax
+
+
+def num_cores() -> int:
+    """CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def make_callbacks_safe() -> None:
+    """Makes JAX's CPU backend run programs in the calling thread.
+
+    Otherwise a program that waits for its callback can hold the very threads which the callback's
+    arguments wait for, and hang (jax-ml/jax issues 24219, 25861). JAX reads this once, when its
+    first array is made: call it before that.
+    """
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
