@@ -63,12 +63,12 @@ class Checkpoints:
         return self._manager.latest_step()
 
     def save(self, updates: int, state: Any, host: dict[str, Any]) -> None:
-        """Writes a pytree of arrays and keys, and JSON data that lives on the host.
+        """Writes a pytree of arrays and keys, and JSON data that lives on the host; nothing where it has a later one.
 
         Raises:
             Exception: of many kinds where the disk is full or the folder is gone; those from before are still there.
         """
-        if updates == self.latest:
+        if self.latest is not None and updates <= self.latest:
             return
         args = ocp.args.Composite(state=ocp.args.StandardSave(_stored(state)), host=ocp.args.JsonSave(host))
         try:

@@ -171,10 +171,10 @@ def summarize(finished: Finished, env: RoverEnv, shortest_m: np.ndarray | None =
         shortest_m: (E,) ``shortest_paths_m`` of the same episodes, where they are known already.
 
     Returns:
-        success, collision, fall, timeout, unstable: shares that sum to 1, and their intervals (success_ci95 ...,
-        Wilson). spl: Anderson et al. 2018, against the shortest collision-free path. path_ratio: driven over
-        shortest, of successful episodes, as is mean_time_s. min_clearance_m: the least distance to a rock's centre
-        over all episodes (None without rocks). mean_return. Success apart for goals that are in the camera's
+        success, collision, fall, timeout, unstable: shares that sum to 1, and the intervals of the first four
+        (success_ci95 ..., Wilson). spl: Anderson et al. 2018, against the shortest collision-free path. path_ratio:
+        driven over shortest, of successful episodes, as is mean_time_s. min_clearance_m: the least distance to a rock's
+        centre over all episodes (None without rocks). mean_return. Success apart for goals that are in the camera's
         horizontal field of view at the start and for others: success_goal_in_view, success_goal_in_view_ci95,
         episodes_goal_in_view, and the same with goal_out_of_view (None where there is no such episode).
     """

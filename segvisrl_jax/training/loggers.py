@@ -98,10 +98,9 @@ class JsonLines:
         self._file.seek(0)
         kept = self._file.read(self._size)
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        file = self._path.open("w+b", buffering=0)
-        file.write(kept)
+        replace_file(self._path, lambda file: file.write(kept))
         self._file.close()
-        self._file = file
+        self._file = self._path.open("r+b", buffering=0)
 
     def _open(self, is_kept: Callable[[dict[str, Any]], bool]) -> FileIO:
         self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -163,6 +162,7 @@ class TensorBoard:
         if self._purge_step is not None:
             began = SessionLog(status=SessionLog.START)
             events.write_event(Event(wall_time=time.time(), step=self._purge_step, session_log=began))
+            self._purge_step = None  # once: a later file of this sitting hides nothing of it
         return events
 
 
@@ -175,11 +175,6 @@ def read_metrics(run_dir: Path) -> list[dict[str, Any]]:
     """
     with (Path(run_dir) / METRICS_FILE).open("rb") as file:
         return [json.loads(line) for line in file if line.endswith(b"\n")]
-
-
-def one_line(error: BaseException) -> str:
-    """What an error says, in one line."""
-    return " ".join(str(error).split())[:300] or type(error).__name__
 
 
 def _row(line: bytes) -> dict[str, Any] | None:

@@ -50,8 +50,7 @@ class TrainResult:
     run_dirs: tuple[Path, ...]  # one for each seed
     finished: bool  # False where a signal ended it early
     not_on_disk: tuple[str, ...]  # what could not be written; empty unless a disk or folder failed
-    decisions: int
-    seconds: float
+    decisions: int  # that are saved
 
     @property
     def run_dir(self) -> Path:
@@ -138,9 +137,9 @@ class Trainer:
         """One rollout: see ``rollout.unroll``."""
         return self._unroll(state.learner, state.actor)
 
-    def evaluate(self, params: Any, seed: int | None = None) -> dict[str, Any]:
+    def evaluate(self, params: Any, seed: int) -> dict[str, Any]:
         """A policy on the validation scenes of a seed."""
-        stream = scene_stream(self.config.seed if seed is None else seed, VALIDATION_STREAM)
+        stream = scene_stream(seed, VALIDATION_STREAM)
         finished = self.evaluator.run(self.devices.on_one(params), stream, self.config.evaluation.episodes)
         return summarize(finished, self.evaluator.env)
 
@@ -149,7 +148,7 @@ class Trainer:
 
 
 def held_out_env(config: EnvConfig) -> EnvConfig:
-    """The same world with the paper's start and goals, ``num_rocks`` rocks, no margin and neutral conditions.
+    """The same world without random headings, with ``num_rocks`` rocks, no margin and neutral conditions.
 
     So it is whatever training is made of.
     """
@@ -164,7 +163,7 @@ def validation_env(config: TrainConfig) -> EnvConfig:
 
 
 class DivergedError(RuntimeError):
-    """Learning has no finite loss or gradient any more."""
+    """Losses or gradients are not finite again and again."""
 
 
 def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | None = None) -> TrainResult:
@@ -181,7 +180,7 @@ def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | N
     Raises:
         ConfigError: where the run folder exists and is not to be resumed, or cannot be; where the policy to start from
             is of another architecture, or sees something else; where a logger is not installed or cannot be opened.
-        DivergedError: where no loss or gradient was finite for ``max_bad_updates`` updates.
+        DivergedError: where a loss or gradient was not finite in each of ``max_bad_updates`` updates in a row.
     """
     processes = join(config)
     processes.together(lambda: require_installed(config.loggers))
@@ -196,14 +195,17 @@ def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | N
             late = functools.partial(session.end_late, when_late) if when_late and processes.count == 1 else None
             with StopSignals(late=late) as stop:
                 finished = session.drive(stop, first_params)
-            missing = tuple(f"{run.folder}: {what}" for run in runs for what in run.not_on_disk())
+            missing = tuple(
+                f"{run.folder}: {what}" for run in runs for what in run.not_on_disk(session.num_to_be_saved)
+            )
         except jax.errors.JaxRuntimeError as error:
             if processes.count > 1:  # at once: closing would wait for those who are gone
                 where = f"{runs[0].folder} has its last checkpoint"
                 processes.give_up(error, f"{where}: start all processes again with --resume")
             raise
     processes.leave()
-    return TrainResult(tuple(run.folder for run in runs), finished, missing, runs[0].decisions, runs[0].host.seconds)
+    decisions = (runs[0].num_saved or 0) * config.ppo.decisions_per_update
+    return TrainResult(tuple(run.folder for run in runs), finished, missing, decisions)
 
 
 def _say_nothing(line: str) -> None:
@@ -233,12 +235,14 @@ class _Session:
         self._saving = threading.Lock()
         self._whole: tuple[TrainingState, list[HostState]] | None = None  # after the last update that is written down
         self._bad_updates = 0  # in a row
+        self.num_to_be_saved: int | None = None  # updates behind the checkpoint that the last save was to write
 
     def drive(self, stop: StopSignals, first_params: Params | None) -> bool:
         """Updates until the end or a signal, and saves; whether it is the end."""
         config = self.config
         self.trainer = Trainer(config)
         state = self._start(first_params)
+        self.num_to_be_saved = self.runs[0].num_saved
         for run in self.runs:
             run.begin()
         every = -(-config.evaluation.every_decisions // config.ppo.decisions_per_update)
@@ -256,8 +260,10 @@ class _Session:
                 display.update(self._decisions, _median(rows))
                 if self._updates % config.checkpoint_every_updates == 0 and not self._bad_updates:
                     self._save(state)
-            self._save(state)
-        return self._updates >= config.num_updates
+            finished = self._updates >= config.num_updates
+            if finished or not self._bad_updates:
+                self._save(state)
+        return finished
 
     def _start(self, first_params: Params | None) -> TrainingState:
         if not self.config.resume:
@@ -317,6 +323,7 @@ class _Session:
             rows[i] |= run.judge(self.trainer.evaluate(params, run.config.seed), params)
 
     def _save(self, state: TrainingState) -> None:
+        self.num_to_be_saved = self._updates
         with self._saving:
             for i, run in enumerate(self.runs):
                 run.save(self.trainer.of_seed(state, i))

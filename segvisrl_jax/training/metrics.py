@@ -5,19 +5,21 @@ number of decisions so far. This file neither computes them nor draws figures; `
 """
 
 import collections
+import contextlib
 import datetime
 import functools
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
+from segvisrl_jax.config import one_line
 from segvisrl_jax.training.loggers import (
     METRICS_FILE,
     STEP_KEY,
@@ -25,18 +27,15 @@ from segvisrl_jax.training.loggers import (
     JsonLines,
     Logger,
     TensorBoard,
-    one_line,
     read_metrics,
 )
 
 __all__ = [
     "METRICS_FILE",
     "STEP_KEY",
-    "TENSORBOARD_FOLDER",
     "MetricsWriter",
     "ProgressDisplay",
     "read_metrics",
-    "track",
 ]
 
 PLAIN_INTERVAL_S = 30.0  # between two lines where nobody watches a terminal: a log stays readable
@@ -52,8 +51,6 @@ SHOWN = (  # what the display shows of a run's numbers: name, label, format
     ("ppo/explained_variance", "explained variance", "{:.2f}"),
     ("evaluation/success", "held-out success", "{:.1%}"),
 )
-
-Item = TypeVar("Item")
 
 
 class MetricsWriter:
@@ -101,8 +98,9 @@ class MetricsWriter:
 
     def close(self) -> None:
         """Closes the files; a second call does nothing."""
-        for name, logger in self._own.items():
-            self._try(name, logger.close)
+        for logger in self._own.values():
+            with contextlib.suppress(OSError):  # what could not be written has been said before
+                logger.close()
         self._for_trackers(lambda tracker: tracker.close())
         self._trackers = {}
 
@@ -206,32 +204,6 @@ class ProgressDisplay:
     def _numbers(self) -> str:
         known = [shown for shown in SHOWN if shown[0] in self._values]
         return "  ".join(f"{label} {form.format(self._values[key])}" for key, label, form in known)
-
-
-def track(
-    items: Iterable[Item],
-    description: str,
-    total: int | None = None,
-    console: Console | None = None,
-    plain_interval_s: float = PLAIN_INTERVAL_S,
-) -> Iterator[Item]:
-    """Passes items on and shows how many are done, like ``ProgressDisplay``.
-
-    Args:
-        items: what to go through.
-        description: what is shown in front.
-        total: how many there are; ``len(items)`` where None.
-        console: rich's console; standard output where None.
-        plain_interval_s: least time between two lines where the console is no terminal.
-
-    Raises:
-        TypeError: where ``total`` is None and items have no length.
-    """
-    count = len(items) if total is None else total  # type: ignore[arg-type]
-    with ProgressDisplay(count, 0, description, console, plain_interval_s) as display:
-        for done, item in enumerate(items, start=1):
-            yield item
-            display.update(done, {})
 
 
 class _Pace:

@@ -14,9 +14,8 @@ import jax
 import numpy as np
 
 from segvisrl_jax.agent.networks import Params
-from segvisrl_jax.config import ConfigError, TrainConfig, flatten, read_json, to_dict
+from segvisrl_jax.config import ConfigError, TrainConfig, flatten, one_line, read_json, to_dict
 from segvisrl_jax.training.checkpoint import Checkpoints, save_policy
-from segvisrl_jax.training.loggers import one_line
 from segvisrl_jax.training.manifest import replace_file
 from segvisrl_jax.training.metrics import MetricsWriter
 from segvisrl_jax.training.processes import Processes
@@ -26,9 +25,10 @@ from segvisrl_jax.training.trackers import open_trackers
 from segvisrl_jax.types import Outcome
 
 RECENT_EPISODES = 200  # what the progress bar's shares are taken over
-FREE_ON_RESUME = (
-    "steps", "resume", "runs_dir", "run", "evaluation", "checkpoint_every_updates", "preset", "loggers",
-    "max_bad_updates", "num_devices", "num_seeds", "coordinator", "num_processes", "process_id",
+FREE_ON_RESUME = (  # not evaluation.rocks and .episodes: the best policy so far was judged by them
+    "steps", "resume", "runs_dir", "run", "evaluation.every_decisions", "evaluation.num_slots", "preset", "loggers",
+    "checkpoint_every_updates", "max_bad_updates", "num_devices", "num_seeds", "coordinator", "num_processes",
+    "process_id",
 )  # fmt: skip
 OUTCOMES = (Outcome.SUCCESS, Outcome.COLLISION, Outcome.FALL, Outcome.TIMEOUT, Outcome.UNSTABLE)
 OURS = ("lock",)  # what may be in a folder that no run has begun in, besides half-written files
@@ -144,9 +144,9 @@ class Run:
             self.num_saved = host.updates
         self._write_policy()
 
-    def not_on_disk(self) -> list[str]:
-        """What could not be written in spite of all tries, after one more."""
-        missing = [] if self.num_saved == self.host.updates else [f"the checkpoint of update {self.host.updates}"]
+    def not_on_disk(self, updates: int | None) -> list[str]:
+        """What could not be written in spite of all tries, after one more; ``updates``: of the expected checkpoint."""
+        missing = [] if self.num_saved == updates else [f"the checkpoint of update {updates}"]
         self._write_policy()
         missing += ["the best policy"] if self._policy_waiting else []
         lines = self._writer.catch_up() if self._writer else 0
@@ -281,7 +281,7 @@ def _require_same_run(config: TrainConfig, then: dict[str, Any], run_dir: Path) 
     """Only the number of steps and bookkeeping may change when a run goes on. What old runs do not say is neutral."""
     now = flatten(json.loads(json.dumps(to_dict(config))))
     for name, value in now.items():
-        if name.split(".")[0] not in FREE_ON_RESUME and value != then.get(name):
+        if name not in FREE_ON_RESUME and value != then.get(name):
             raise ConfigError(f"{name} = {value!r}: should be {then.get(name)!r}, as when {run_dir} was started")
 
 

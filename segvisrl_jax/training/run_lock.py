@@ -1,12 +1,14 @@
 """One process at a time writes to a run's folder. The kernel ends the lock with its process, however that ends."""
 
 import contextlib
+import time
 from pathlib import Path
 from typing import IO
 
 from segvisrl_jax.config import ConfigError
 
 LOCK_FILE = "lock"
+TRIES, TRY_EVERY_S = 6, 0.1  # who only looks (``is_being_trained``) holds it for a moment
 
 
 class RunLock:
@@ -18,11 +20,14 @@ class RunLock:
 
     def __init__(self, run_dir: Path) -> None:
         self._file: IO[bytes] = (Path(run_dir) / LOCK_FILE).open("wb")
-        try:
-            _lock(self._file, exclusive=True)
-        except BlockingIOError:
-            self._file.close()
-            raise ConfigError(f"run = {str(run_dir)!r}: another process is training it") from None
+        for tries_left in reversed(range(TRIES)):
+            try:
+                return _lock(self._file, exclusive=True)
+            except BlockingIOError:
+                if tries_left:
+                    time.sleep(TRY_EVERY_S)
+        self._file.close()
+        raise ConfigError(f"run = {str(run_dir)!r}: another process is training it")
 
     def close(self) -> None:
         """Lets go of the folder; a second call does nothing."""

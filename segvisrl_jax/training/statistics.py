@@ -103,7 +103,7 @@ def spl(
     Args:
         success: S, whether each episode reached its goal.
         shortest_m: l, length of the shortest collision-free path
-            (``shortest_path.shortest_path_m``). Where 0 or infinite, a success counts in full.
+            (``shortest_path.shortest_path_m``). Where it is infinite, or both are 0, a success counts in full.
         driven_m: p, length of the path driven.
 
     Raises:

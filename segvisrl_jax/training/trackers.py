@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from segvisrl_jax.config import ConfigError, LoggerName, TrainConfig, flatten, to_dict
-from segvisrl_jax.training.loggers import Logger, Numbers, one_line
+from segvisrl_jax.config import ConfigError, LoggerName, TrainConfig, flatten, one_line, to_dict
+from segvisrl_jax.training.loggers import Logger, Numbers
 
 PROJECT = "segvisrl_jax"
 IDS_FILE = "loggers.json"  # by logger, the id of the run there, so that a resumed run goes on in it

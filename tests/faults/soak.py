@@ -139,9 +139,12 @@ def count_lines(file: Path) -> int:
 
 def counted(rounds: int, name: str) -> Iterator[int]:
     """Numbers from 0, with a display of how far it is."""
-    from segvisrl_jax.training.metrics import track
+    from segvisrl_jax.training.metrics import ProgressDisplay
 
-    return track(range(rounds), f"soak {name}")
+    with ProgressDisplay(rounds, description=f"soak {name}") as display:
+        for number in range(rounds):
+            yield number
+            display.update(number + 1, {})
 
 
 def main(words: list[str] | None = None) -> int:

@@ -1,6 +1,8 @@
 """NaN on purpose, in the physics and in the weights, while a run trains: counted, survived, or stopped in time."""
 
 import dataclasses
+import os
+import signal
 
 import jax
 import jax.numpy as jnp
@@ -93,6 +95,20 @@ def test_a_run_without_finite_losses_stops_and_keeps_the_last_good_checkpoint(du
     going_on = loop.train(settings(tmp_path, resume=True), say=lambda line: None)
     assert going_on.finished
     assert all(row["ppo/skipped_steps"] == 0 for row in read_metrics(tmp_path / "run"))
+
+
+@pytest.mark.slow
+def test_what_is_stopped_in_a_bad_phase_goes_on_from_before_it(during, tmp_path):
+    def spoil_and_stop(state):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return spoil_learning(state)
+
+    during[3] = spoil_and_stop
+    result = loop.train(settings(tmp_path), say=lambda line: None)
+    assert (result.finished, result.decisions, result.not_on_disk) == (False, 2 * 32, ())
+    during.clear()
+    assert loop.train(settings(tmp_path, resume=True), say=lambda line: None).finished
+    assert [row["ppo/skipped_steps"] for row in read_metrics(tmp_path / "run")] == [0] * NUM_UPDATES
 
 
 @pytest.mark.slow

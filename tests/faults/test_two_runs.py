@@ -1,9 +1,11 @@
 """One process at a time in a run's folder; the lock ends with its process, also where that is killed."""
 
+import fcntl
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
@@ -35,6 +37,16 @@ def test_the_second_is_refused_until_the_first_is_gone(holder, tmp_path):
     holder.wait()
     assert not is_being_trained(tmp_path)
     RunLock(tmp_path).close()
+
+
+def test_who_only_looks_is_waited_for(tmp_path):
+    (tmp_path / "lock").touch()
+    with (tmp_path / "lock").open("rb") as looking:
+        fcntl.flock(looking, fcntl.LOCK_SH)
+        done = threading.Timer(0.2, fcntl.flock, (looking, fcntl.LOCK_UN))
+        done.start()
+        RunLock(tmp_path).close()
+        done.join()
 
 
 def test_a_folder_without_a_run_is_not_being_trained(tmp_path):

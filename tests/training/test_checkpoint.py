@@ -33,6 +33,15 @@ def test_checkpoints_come_back_bit_by_bit(tmp_path):
     checkpoints.close()
 
 
+def test_an_older_state_is_not_written_over_a_newer_one(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    for updates in (2, 1):
+        checkpoints.save(updates, state(), {"updates": updates})
+    assert checkpoints.latest == 2
+    assert checkpoints.restore_latest(state())[1] == {"updates": 2}
+    checkpoints.close()
+
+
 def test_a_checkpoint_of_another_shape_is_refused(tmp_path):
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(1, state(), {})

@@ -46,7 +46,7 @@ def train(*runs):
 def rows(folder):
     """What each update logged, without the times it took."""
     lines = (folder / "run" / "metrics.jsonl").read_text().splitlines()
-    return [{name: value for name, value in json.loads(line).items() if "time" not in name} for line in lines]
+    return [{name: value for name, value in json.loads(line).items() if not name.startswith("time/")} for line in lines]
 
 
 def assert_same_run(folder, other):

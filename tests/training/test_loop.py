@@ -169,6 +169,7 @@ def test_an_existing_run_is_not_overwritten(config, tmp_path):
         ({"num_rocks": 5}, "num_rocks.* = 5.*should be 4"),
         ({"learning_rate": 0.5}, "learning_rate = 0.5"),
         ({"seed": 9}, "seed = 9.*should be 0"),
+        ({"rocks": 7}, r"evaluation\.rocks = 7.*should be None"),
     ],
 )
 def test_a_run_goes_on_only_as_itself(change, says, config):

@@ -1,16 +1,19 @@
 """Metrics on disk, in TensorBoard, and on the screen."""
 
+import errno
 import io
 import json
 import re
+import resource
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboardX.event_file_writer import EventsWriter
 
-from segvisrl_jax.training.metrics import MetricsWriter, ProgressDisplay, read_metrics, track
+from segvisrl_jax.training.metrics import MetricsWriter, ProgressDisplay, read_metrics
 
 
 def scalars(run_dir, name):
@@ -56,6 +59,61 @@ def test_resume_drops_what_lies_beyond_in_both_logs(tmp_path):
         writer.write(3, {"a": 30})
     assert [row["a"] for row in read_metrics(tmp_path)] == [0, 1, 2, 30]
     assert scalars(tmp_path, "a") == [(0, 0), (1, 1), (2, 2), (3, 30)]
+
+
+def test_one_failure_hides_nothing_that_tensorboard_had(tmp_path, monkeypatch):
+    with MetricsWriter(tmp_path, say=lambda line: None) as writer:
+        writer.resume_at(0)
+        for step in (10, 20):
+            writer.write(step, {"a": step})
+        with monkeypatch.context() as full:
+            full.setattr(EventsWriter, "flush", failing)
+            writer.write(30, {"a": 30})
+        writer.write(40, {"a": 40})
+    assert {(10, 10), (20, 20), (40, 40)} <= {(step, round(value.expected)) for step, value in scalars(tmp_path, "a")}
+
+
+def failing(*given):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.fixture
+def size_limit():
+    """Sets the size beyond which this process can write to no file, and lifts it again."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (before[0] if size is None else size, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_file_that_vanished_is_whole_again_or_not_there(tmp_path, size_limit):
+    """It vanishes when there is room for half of it."""
+    said, lines, path = [], [], tmp_path / "metrics.jsonl"
+    with MetricsWriter(tmp_path, tensorboard=False, say=said.append) as writer:
+        for step in range(200):
+            writer.write(step, {"a": step})
+        lines = path.read_bytes()
+        path.unlink()
+        size_limit(len(lines) // 2)
+        writer.write(200, {"a": 200})
+        assert not path.exists()
+        size_limit(None)
+        writer.write(201, {"a": 201})
+        assert [row["step"] for row in read_metrics(tmp_path)] == list(range(202))
+    assert path.read_bytes().startswith(lines)
+    assert len(said) == 2
+    assert "cannot be written" in said[0]
+    assert said[1] == "metrics.jsonl is written again"
+
+
+def test_closing_does_not_say_that_what_is_lost_was_written(tmp_path, size_limit):
+    said = []
+    with MetricsWriter(tmp_path, tensorboard=False, say=said.append) as writer:
+        writer.write(1, {"a": 1})
+        size_limit((tmp_path / "metrics.jsonl").stat().st_size)
+        writer.write(2, {"a": 2})
+        assert writer.catch_up() == 1
+    assert len(said) == 1
+    assert "cannot be written" in said[0]
 
 
 def test_a_line_that_a_crash_cut_off_is_dropped(tmp_path):
@@ -147,14 +205,3 @@ def test_interruption_passes_through_and_restores_the_cursor(make_console):
     shown = console.file.getvalue()
     assert "1/10" in shown
     assert shown.count("\x1b[?25l") == shown.count("\x1b[?25h")  # hidden as often as shown
-
-
-@pytest.mark.parametrize("make_console", [plain_console, terminal_console])
-def test_track_passes_items_on(make_console):
-    console = make_console()
-    assert list(track("abc", "testing", console=console)) == ["a", "b", "c"]
-    assert "testing" in console.file.getvalue()
-    assert "3/3 100%" in console.file.getvalue()
-    with pytest.raises(TypeError):
-        list(track(iter("abc"), "testing", console=console))
-    assert list(track(iter("abc"), "testing", total=3, console=console)) == ["a", "b", "c"]

@@ -63,7 +63,7 @@ def wait(folder, processes, seconds=START_S):
 def rows(folder):
     file = folder / "run" / "metrics.jsonl"
     lines = file.read_text().splitlines() if file.exists() else []
-    return [{name: value for name, value in json.loads(line).items() if "time" not in name} for line in lines]
+    return [{name: value for name, value in json.loads(line).items() if not name.startswith("time/")} for line in lines]
 
 
 def wait_for_rows(folder, processes, count):
