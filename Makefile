@@ -30,7 +30,7 @@ endif
 
 help: ## this list
 	@echo "usage: make TARGET [ARCH=cnn_lstm|cnn|cnn_lstm_raw|mlp|mlp_rocks] [PRESET=auto|cpu|gpu|paper|smoke] [STEPS=] [SEED=] [RUN=] [ARGS=]"
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  \1\t\2/' | expand -t 14
+	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  \1\t\2/' | expand -t 14
 
 setup: $(READY) ## create .venv from the pinned lock (every other target does it by itself)
 
@@ -50,7 +50,7 @@ $(EXTRAS_READY): requirements-extras.lock $(READY)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-extras.lock
 	@touch $@
 
-sb3: $(READY) ## add Stable-Baselines3 and PyTorch (for a CPU: 0.9 GB) to .venv; its tests run from then on
+sb3: $(READY) ## add Stable-Baselines3 and PyTorch (0.9 GB for a CPU; PyPI's own build for Linux brings CUDA, several GB) to .venv; its tests run from then on
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check torch==2.13.0 stable-baselines3==2.9.2 sb3-contrib==2.9.2
 
 train: $(READY) ## train ARCH with PRESET, evaluate it, write runs/<name>/

@@ -37,7 +37,7 @@ class FailuresOptions:
     episodes: int = 200
     """Scenes 0 to this are driven."""
     num_rocks: int | None = None
-    """Rocks on the map; default: as the policy was trained with."""
+    """Rocks on the map; default: env.scene.num_rocks of its settings."""
     seed: int = 0
     """Names the test scenes, as for segvisrl eval."""
     most: int = 8

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 _PACKAGE = Path(__file__).resolve().parent
+DEFAULT_POLICY = "cnn_lstm"  # of those in pretrained/: drives where nobody says who
 
 
 def asset_dir(name: str) -> Path:

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from segvisrl_jax.assets import DEFAULT_POLICY
 from segvisrl_jax.cli import parse
 from segvisrl_jax.config import require, require_file_can_be_written
 
-DEFAULT_POLICY = "cnn_lstm"
 VIDEO_SUFFIXES = (".mp4", ".gif")
 
 
@@ -22,7 +22,7 @@ class DemoOptions:
     """A policy's folder, or the name of a shipped one. Default: cnn_lstm."""
     controller: Literal["p", "random", "planner"] | None = None
     scene: int = 0
-    """Number of the scene."""
+    """Number of the test scene, among those of `segvisrl eval --seed 0`."""
     num_rocks: int | None = None
     output: Path = Path("demo.mp4")
     """Where to write the video, .mp4 or .gif."""
@@ -60,7 +60,7 @@ def record(asked: DemoOptions) -> str:
     policy_name = asked.policy if named else DEFAULT_POLICY
     policy, params, config = load_driver(asked.run, policy_name, asked.controller)
     env = RoverEnv(with_overrides(config, asked.num_rocks, None, None))
-    episode = drive_episode(env, policy, params, scene_stream(asked.scene, TEST_STREAM))
+    episode = drive_episode(env, policy, params, scene_stream(0, TEST_STREAM), asked.scene)
     frames = episode_frames(env, episode, title=policy.name)
     write_video(asked.video, frames, fps=FRAMES_PER_SECOND)
     return episode.outcome.name.lower()

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from segvisrl_jax.cli import parse
-from segvisrl_jax.config import Arch, preset_config
+from segvisrl_jax.config import Arch, one_line, preset_config
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -76,7 +76,7 @@ def _preset(measure: bool) -> "Iterator[Finding]":
     """The speed of the training that ``make train`` would do, then what that training is, and how long it takes."""
     from segvisrl_jax.commands.train import TEST_EPISODES, preset_for_this_machine
     from segvisrl_jax.machine import reading
-    from segvisrl_jax.machine.finding import Finding, one_line
+    from segvisrl_jax.machine.finding import Finding
 
     preset = preset_for_this_machine()
     config = preset_config(ARCH, preset)

@@ -37,7 +37,7 @@ class EvalOptions:
     seed: int = 0
     """Names the test scenes."""
     num_rocks: int | None = None
-    """Rocks on the map, where it should differ from the policy's training."""
+    """Rocks on the map; default: env.scene.num_rocks of the policy's settings."""
     renderer: RendererName | None = None
     physics: EngineName | None = None
     json: Path | None = None
@@ -172,7 +172,8 @@ def load_driver(run: Path | None, policy: str | None, controller: str | None) ->
 
     if controller:
         require(controller in CONTROLLERS, "--controller", controller, "one of " + ", ".join(CONTROLLERS))
-        return CONTROLLERS[controller](), (), EnvConfig(obs="state")
+        world = EnvConfig(obs="state")
+        return CONTROLLERS[controller](world), (), world
 
     from segvisrl_jax.agent.networks import make_network
     from segvisrl_jax.env.rover_env import observation_shape

@@ -41,7 +41,7 @@ class ReportOptions:
     seed: int = 0
     """Names the test scenes, as for segvisrl eval."""
     num_rocks: int | None = None
-    """Rocks on the map; default: as the first run was trained with."""
+    """Rocks on the map; default: env.scene.num_rocks of the first run."""
     videos: int = MOST_VIDEOS
     """Videos at most."""
 

@@ -8,15 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from segvisrl_jax.cli import INTERRUPTED, parse
+from segvisrl_jax.cli import FAILURE, INTERRUPTED, parse
 from segvisrl_jax.config import ConfigError, PresetName, require, require_folder_can_be_made
 from segvisrl_jax.sweep.plan import parse_axis
 
 if TYPE_CHECKING:
     from segvisrl_jax.sweep.engines import Ended
     from segvisrl_jax.sweep.plan import Trial
-
-FAILURE = 1
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from segvisrl_jax.config import (
 )
 
 SHOW_CURSOR = "\x1b[?25h"
+SAID_AGAIN = ("steps", "checkpoint_every_updates", "max_bad_updates", "num_devices", "loggers")  # if changed on resume
 TEST_EPISODES = 200  # driven after training, on scenes that neither training nor the choice of the policy saw
 
 
@@ -38,8 +39,9 @@ def run(options: Sequence[str]) -> int:
     is_first = config.process_id == 0
     if not config.resume and is_first:
         print(differences_from_paper(config))
+        print(rocks_in_scenes(config))
         print(observation_memory(config))
-    going_on = f"Go on with:\n  {_resuming(config)}"
+    going_on = f"Go on with:\n  {resume_command(config)}"
     try:
         with _told_where_memory_ends(config):
             result = train(config, when_late=lambda said: _end_now(f"{said} {going_on}"))
@@ -61,10 +63,17 @@ def run(options: Sequence[str]) -> int:
     return 0
 
 
-def _resuming(config: TrainConfig) -> str:
-    """The command that goes on with a run, or with all seeds."""
-    resume = f"segvisrl train --resume --runs-dir {config.runs_dir} --run {config.run_name}"
-    return resume + (f" --seed {config.seed} --num-seeds {config.num_seeds}" if config.num_seeds > 1 else "")
+def resume_command(config: TrainConfig) -> str:
+    """The command that goes on with a run, or with all seeds: with what was said since the run began, too."""
+    words: list[Any] = ["segvisrl train --resume", "--runs-dir", config.runs_dir, "--run", config.run_name]
+    if config.num_seeds > 1:
+        words += ["--seed", config.seed, "--num-seeds", config.num_seeds]
+    began = (config.resume and _stored_config(config.runs_dir, config.runs[0].run_name)) or config
+    for name in SAID_AGAIN:
+        value = getattr(config, name)
+        if value != getattr(began, name):
+            words += [f"--{name.replace('_', '-')}", *(value if isinstance(value, tuple) else [value])]
+    return " ".join(map(str, words))
 
 
 def _end_now(said: str) -> None:
@@ -91,7 +100,11 @@ def parse_config(options: Sequence[str]) -> TrainConfig:
         require("--coordinator" not in words, "preset", "auto", should)  # JAX is not to be asked before they have met
         preset = preset_for_this_machine()
         words = _without(words, "--preset")
-    return parse(TrainConfig, words, "train", preset_config(arch, preset))
+    base = preset_config(arch, preset)
+    said = {word.replace("_", "-") for word in words}
+    if "--env.scene.num-rocks" in said and "--env.scene.random-num-rocks-max" not in said:
+        base = replace_fields(base, random_num_rocks_max=0, rocks=None)  # what is said counts, not the preset's choice
+    return parse(TrainConfig, words, "train", base)
 
 
 def _stored_config(runs_dir: str, run_name: str) -> TrainConfig | None:
@@ -110,7 +123,7 @@ def preset_for_this_machine() -> PresetName:
     """What ``--preset auto`` takes: gpu where JAX has an accelerator, else cpu."""
     import jax
 
-    from segvisrl_jax.env.physics.native import make_callbacks_safe
+    from segvisrl_jax.cpu import make_callbacks_safe
 
     make_callbacks_safe()  # before the next line starts JAX's backends
     return "cpu" if jax.default_backend() == "cpu" else "gpu"
@@ -150,6 +163,14 @@ def differences_from_paper(config: TrainConfig) -> str:
     if not rows:
         return title + "the paper's settings."
     return "\n".join([title + "differs from the paper's settings in", *rows])
+
+
+def rocks_in_scenes(config: TrainConfig) -> str:
+    """One line: how many there are in which scenes."""
+    scene, validation = config.env.scene, config.evaluation.rocks
+    trained = f"0 to {scene.random_num_rocks_max}" if scene.random_num_rocks_max else str(scene.num_rocks)
+    judged = scene.num_rocks if validation is None else validation
+    return f"  rocks: {trained} in training, {judged} in validation scenes, {scene.num_rocks} in test scenes"
 
 
 def observation_memory(config: TrainConfig) -> str:
@@ -200,7 +221,7 @@ def _finish(config: TrainConfig, run_dir: Path) -> None:
     from segvisrl_jax.report.figures import learning_curve
 
     episodes = min(TEST_EPISODES, 5 * config.evaluation.episodes)  # fewer after a smoke test
-    result = evaluate(EvalOptions(run=run_dir, episodes=episodes, seed=config.seed, slots=config.evaluation.num_slots))
+    result = evaluate(EvalOptions(run=run_dir, episodes=episodes, slots=config.evaluation.num_slots))
     (run_dir / "eval.json").write_text(as_json(result))
     learning_curve([run_dir], run_dir / "learning_curve.png")
     demo.record(demo.DemoOptions(run=run_dir, output=run_dir / "rollout.mp4"))

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+from segvisrl_jax.assets import DEFAULT_POLICY
 from segvisrl_jax.cli import parse
 from segvisrl_jax.config import ConfigError, require
-
-DEFAULT_POLICY = "cnn_lstm"
 
 
 @dataclass(frozen=True)

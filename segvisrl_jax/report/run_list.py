@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from segvisrl_jax.config import is_finite, is_plain_text, read_json, require
+from segvisrl_jax.config import is_finite, is_plain_text, one_line, read_json, require
 from segvisrl_jax.training.loggers import METRICS_FILE, STEP_KEY
 from segvisrl_jax.training.metrics_rows import MOST_DECISIONS, read_rows
 from segvisrl_jax.training.run_lock import is_being_trained
@@ -206,5 +206,4 @@ def _test_score(path: Path) -> Score | None:
 
 def _one_line(error: Exception) -> str:
     """What is wrong; a missing name is said as such."""
-    text = " ".join(str(error).split())[:200] or type(error).__name__
-    return f"no {text}" if isinstance(error, KeyError) else text
+    return f"no {one_line(error)}" if isinstance(error, KeyError) else one_line(error)

@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,8 +90,11 @@ class Evaluation:
 
     @property
     def decisions(self) -> str | None:
-        """Length of the training."""
-        return f"{self.training_config['steps']:,}" if self.training_config else None
+        """Length of the training, and what it started from where that was a policy."""
+        if not self.training_config:
+            return None
+        source = Path(str(self.training_config.get("start_from", ""))).name
+        return f"{self.training_config['steps']:,}" + (f" from {source}" if source else "")
 
     @property
     def variant(self) -> tuple[Any, ...]:

@@ -39,9 +39,9 @@ class Session:
     # Which episode
 
     def new_scene(self, number: int) -> None:
-        """The start of an episode on another scene."""
+        """The start of an episode on another test scene, of those of ``segvisrl eval --seed 0``."""
         self.number = number
-        self._key = jax.random.fold_in(scene_stream(number, TEST_STREAM), 0)
+        self._key = jax.random.fold_in(scene_stream(0, TEST_STREAM), number)
         self.reset()
 
     def reset(self) -> None:

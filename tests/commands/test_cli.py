@@ -8,8 +8,9 @@ import sys
 import pytest
 
 from segvisrl_jax.cli import main
-from segvisrl_jax.commands.train import parse_config
+from segvisrl_jax.commands.train import parse_config, resume_command, rocks_in_scenes
 from segvisrl_jax.config import preset_config, replace_fields, to_dict
+from segvisrl_jax.training.run import open_run_dir
 
 PROGRAM = [sys.executable, "-m", "segvisrl_jax.cli"]
 SMOKE = ["--preset", "smoke", "--steps", "256", "--env.task.max-decisions", "20"]  # short videos
@@ -239,3 +240,32 @@ def test_a_run_that_was_moved_goes_on_where_it_is(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     goes_on = parse_config(["--resume", "--run", "moved"])
     assert (goes_on.runs_dir, goes_on.run, goes_on.seed) == ("runs", "moved", 3)
+    assert resume_command(goes_on) == "segvisrl train --resume --runs-dir runs --run moved"
+    longer = parse_config(["--resume", "--run", "moved", "--steps", "99999", "--loggers", "wandb", "mlflow"])
+    assert parse_config(resume_command(longer).split()[2:]) == longer
+
+
+@pytest.mark.parametrize(
+    ("said", "rocks"),
+    [
+        ("", "0 to 32 in training, 32 in validation scenes, 4 in test scenes"),
+        ("--env.scene.num-rocks 16", "16 in training, 16 in validation scenes, 16 in test scenes"),
+        ("--env.scene.num_rocks 16 --evaluation.rocks 8", "16 in training, 8 in validation scenes, 16 in test scenes"),
+        (
+            "--env.scene.num-rocks=8 --env.scene.random-num-rocks-max=16",
+            "0 to 16 in training, 32 in validation scenes, 8 in test scenes",
+        ),
+    ],
+)
+def test_a_number_of_rocks_that_is_said_counts(said, rocks):
+    config = parse_config(["--arch", "cnn_lstm", "--preset", "cpu", *said.split()])
+    assert rocks_in_scenes(config) == f"  rocks: {rocks}"
+
+
+def test_the_command_that_goes_on_with_seeds_means_all_of_them(tmp_path):
+    words = ["--arch", "mlp", "--preset", "smoke", "--runs-dir", str(tmp_path), "--run", "run", "--seed", "3"]
+    together = parse_config([*words, "--num-seeds", "2"])
+    for each in together.runs:
+        open_run_dir(each)
+    goes_on = parse_config(resume_command(together).split()[2:])
+    assert goes_on == replace_fields(together, resume=True)

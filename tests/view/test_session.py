@@ -46,7 +46,7 @@ def beside(session: Session, x_m: float, y_m: float) -> tuple[float, float]:
 @pytest.mark.slow
 def test_the_policy_drives_as_in_the_demo(session, driven):
     env, policy, params = driven
-    episode = drive_episode(env, policy, params, scene_stream(SCENE, TEST_STREAM))
+    episode = drive_episode(env, policy, params, scene_stream(0, TEST_STREAM), SCENE)
     for step in range(1, 8):
         assert np.array_equal(session.observation, episode.observations[step - 1])
         session.decide(None)
