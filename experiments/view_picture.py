@@ -31,7 +31,7 @@ CLOSE_NOTE = "document.querySelectorAll('.mantine-Notification-closeButton').for
 # %% The page, and a browser that looks at it
 viewer = open_viewer(ViewOptions(scene=SCENE, num_rocks=NUM_ROCKS, port=0))
 stop = threading.Event()
-loop = threading.Thread(target=viewer.run, args=(stop,))
+loop = threading.Thread(target=viewer.run, args=(stop,), daemon=True)
 loop.start()
 options = webdriver.ChromeOptions()
 options.binary_location = shutil.which("chromium") or shutil.which("google-chrome") or ""
@@ -42,7 +42,7 @@ browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(shut
 browser.get(f"http://127.0.0.1:{viewer.server.get_port()}")
 
 # %% It drives; the loop ends between two frames, and the page keeps what it shows
-while viewer.session.time_s < DRIVEN_S and not viewer.session.is_over:
+while loop.is_alive() and viewer.session.time_s < DRIVEN_S and not viewer.session.is_over:
     time.sleep(0.05)
 stop.set()
 loop.join()

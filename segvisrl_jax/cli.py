@@ -10,7 +10,9 @@ import io
 import os
 import re
 import sys
+import typing
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TypeVar
 
 from segvisrl_jax.config import ConfigError
@@ -111,7 +113,10 @@ def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: O
     import tyro
 
     said = io.StringIO()
-    words = [_whole_number(word) for word in options]
+    words = [
+        word if _takes_text(kind, before) else _whole_number(word)
+        for before, word in zip(["", *options], options, strict=False)
+    ]
     try:
         with contextlib.redirect_stderr(said):
             if default is None:
@@ -128,6 +133,15 @@ def _config_error(error: BaseException | None) -> ConfigError | None:
     while error is not None and not isinstance(error, ConfigError):
         error = error.__context__
     return error
+
+
+def _takes_text(kind: type, option: str) -> bool:
+    """Whether what follows a word is a name or a path, which may look like a number."""
+    *parts, last = option.removeprefix("--").replace("-", "_").split(".")
+    for part in parts:
+        kind = typing.get_type_hints(kind).get(part, object)
+    hint = typing.get_type_hints(kind).get(last)
+    return bool({str, Path} & {hint, *typing.get_args(hint)})
 
 
 def _whole_number(word: str) -> str:

@@ -2,8 +2,6 @@
 
 import os
 
-import jax
-
 
 def num_cores() -> int:
     """CPU cores that this process may use."""
@@ -17,4 +15,6 @@ def make_callbacks_safe() -> None:
     arguments wait for, and hang (jax-ml/jax issues 24219, 25861). JAX reads this once, when its
     first array is made: call it before that.
     """
+    import jax  # here, so that every command may ask for the cores at no cost
+
     jax.config.update("jax_cpu_enable_async_dispatch", False)

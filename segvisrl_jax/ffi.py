@@ -5,7 +5,9 @@ for the next process. What is called by name can be kept, and needs no arrays ma
 of ``xla/ffi/api/c_api.h`` in jaxlib's include folder, API version 0.3 (XLA supports a version for at least a year).
 """
 
+import _thread
 import ctypes
+import threading
 from collections.abc import Callable
 from ctypes import POINTER, Structure, c_char_p, c_float, c_int, c_int64, c_size_t, c_uint32, c_void_p
 from typing import Any
@@ -17,6 +19,7 @@ API_MAJOR, API_MINOR = 0, 3
 METADATA_EXTENSION = 1
 INTERNAL_ERROR = 13
 F32 = 11  # XLA_FFI_DataType_F32
+TOLD_AGAIN_S = 0.01
 BatchFunction = Callable[[list[np.ndarray], list[np.ndarray]], None]
 
 
@@ -92,7 +95,7 @@ def register(target: str, function: BatchFunction) -> None:
         if _answered_metadata(frame):
             return None
         try:
-            function(_arrays(frame.arguments), _arrays(frame.results))
+            _call(function, _arrays(frame.arguments), _arrays(frame.results))
         except BaseException as error:  # no exception may pass through C
             return _error(frame, f"{target}: {type(error).__name__}: {error}")
         return None
@@ -101,6 +104,15 @@ def register(target: str, function: BatchFunction) -> None:
     _registered[target] = handler
     address = ctypes.cast(handler, c_void_p)
     jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(address), platform="cpu")
+
+
+def _call(function: BatchFunction, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+    """Calls it; Ctrl-C that comes meanwhile, in the main thread, is told again when it passes through Python alone."""
+    try:
+        function(arguments, results)
+    except KeyboardInterrupt:
+        threading.Timer(TOLD_AGAIN_S, _thread.interrupt_main).start()
+        function(arguments, results)
 
 
 def _answered_metadata(frame: CallFrame) -> bool:

@@ -1,5 +1,7 @@
 """NumPy functions called by name from compiled programs."""
 
+import time
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -71,3 +73,21 @@ def wheels(engine, action):
     from segvisrl_jax.env.physics.engine import wheel_command
 
     return wheel_command(action, engine._max_wheel_speed).reshape(-1, 4)
+
+
+def test_ctrl_c_in_a_function_comes_when_the_program_has_ended():
+    calls = []
+
+    def interrupted_once(arguments, results):
+        calls.append(len(calls))
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        results[0][...] = 7
+
+    ffi.register("test_interrupted", interrupted_once)
+    found = []
+    with pytest.raises(KeyboardInterrupt):  # noqa: PT012
+        found.append(np.asarray(called("test_interrupted", jnp.zeros(3))))
+        time.sleep(5)  # it comes here at the latest
+    assert calls == [0, 1]
+    assert all(np.array_equal(one, [7, 7, 7]) for one in found)

@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -26,6 +27,7 @@ from segvisrl_jax.config import (
     require,
     require_file_can_be_written,
 )
+from segvisrl_jax.cpu import num_cores
 from segvisrl_jax.machine.growth import GrowthSizes
 
 Part = Literal["physics", "render", "policy", "update", "train", "start", "peers", "growth"]
@@ -104,9 +106,9 @@ def run(options: Sequence[str]) -> int:
         rows += [{"part": part, **row} for row in measured]
         if part == "growth":
             rows += _conclude_growth(asked, measured)
-    if asked.json is not None:
-        command = " ".join(["segvisrl bench", *options])
-        asked.json.write_text(json.dumps({"command": command, "machine": before, "rows": rows}, indent=2) + "\n")
+        if asked.json is not None:  # after each part: a later one may fail
+            command = shlex.join(["segvisrl", "bench", *options])
+            asked.json.write_text(json.dumps({"command": command, "machine": before, "rows": rows}, indent=2) + "\n")
     return 0
 
 
@@ -121,7 +123,7 @@ def machine() -> dict[str, Any]:
         "processor": _processor(),
         "load_before": round(os.getloadavg()[0], 2),
         "devices": [device.device_kind for device in jax.devices()],
-        "cores": os.cpu_count(),
+        "cores": num_cores(),
         "python": platform.python_version(),
         "versions": {name: version(name) for name in packages},
     }

@@ -79,6 +79,7 @@ def evaluate(asked: EvalOptions) -> dict[str, Any]:
     from segvisrl_jax.training.metrics import ProgressDisplay
 
     policy, params, config = load_driver(asked.run, asked.policy, asked.controller)
+    record = training_record(asked, params)  # now: a run that trains may have a better policy when this ends
     env_config = with_overrides(config, asked.num_rocks, asked.renderer, asked.physics, asked.conditions)
     env = RoverEnv(env_config)
     evaluator = Evaluator(env, policy, min(asked.slots, asked.episodes))
@@ -93,7 +94,7 @@ def evaluate(asked: EvalOptions) -> dict[str, Any]:
         "source": str(asked.run or asked.policy or asked.controller),
         **summarize(finished, env, shortest_m),
         "seed": asked.seed,
-        **training_record(asked),
+        **record,
         "command": command_line(asked),
         "wall_clock_s": round(wall_clock_s, 2),
         **machine_record(),
@@ -104,8 +105,8 @@ def evaluate(asked: EvalOptions) -> dict[str, Any]:
     }
 
 
-def training_record(asked: EvalOptions) -> dict[str, Any]:
-    """training_seed, training_config and policy_sha256 (of the parameters); None for a controller."""
+def training_record(asked: EvalOptions, params: Any) -> dict[str, Any]:
+    """training_seed, training_config and policy_sha256 (of the parameters that drive); None for a controller."""
     if not (asked.run or asked.policy):
         return {"training_seed": None, "training_config": None, "policy_sha256": None}
     import hashlib
@@ -114,7 +115,7 @@ def training_record(asked: EvalOptions) -> dict[str, Any]:
 
     from segvisrl_jax.training.checkpoint import load_policy
 
-    config, params, _ = load_policy(policy_folder(asked.run, asked.policy))
+    config, _, _ = load_policy(policy_folder(asked.run, asked.policy))
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(params):  # in the order of their names
         digest.update(leaf.tobytes())

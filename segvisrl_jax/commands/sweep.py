@@ -100,8 +100,6 @@ def _train(asked: SweepOptions, missing: "Sequence[Trial]", note: "Callable[[Tri
         counted = f"{len(missing)} run{'' if len(missing) == 1 else 's'}"
         progress.console.print(f"{counted}; logs in {asked.output}", highlight=False)
         for trial, ended in _ends(asked, missing):
-            if ended.code in (INTERRUPTED, -signal.SIGINT):
-                raise KeyboardInterrupt
             progress.console.print(f"  {note(trial, _status(asked, trial, ended), ended.node)}", highlight=False)
             progress.advance(bar)
 
@@ -119,6 +117,8 @@ def _status(asked: SweepOptions, trial: "Trial", ended: "Ended") -> str:
 
     if ended.code == 0 and _is_finished(asked.output / trial.name):
         return DONE
+    if ended.code in (INTERRUPTED, -signal.SIGINT, -signal.SIGTERM):
+        return "stopped"
     return f"failed ({ended.trouble or ended.code})"
 
 
@@ -132,5 +132,6 @@ def _report(asked: SweepOptions, labels: Sequence[str], rows: Sequence[dict[str,
     print(f"  {asked.output / 'results.csv'}")
     failed = len(rows) - len(done)
     if failed:
-        print(f"{failed} of {len(rows)} runs failed; their logs are in {asked.output}", file=sys.stderr)
+        why = f"{failed} of {len(rows)} runs failed or were stopped"
+        print(f"{why}; their logs are in {asked.output}, and the same command goes on with them", file=sys.stderr)
     return FAILURE if failed else 0

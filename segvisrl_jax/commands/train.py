@@ -3,6 +3,7 @@
 import contextlib
 import math
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 from segvisrl_jax.cli import FAILURE, INTERRUPTED, parse
 from segvisrl_jax.config import (
+    BOOKKEEPING,
     IMAGE_OBSERVATIONS,
     ConfigError,
     PresetName,
@@ -65,7 +67,7 @@ def run(options: Sequence[str]) -> int:
 
 def resume_command(config: TrainConfig) -> str:
     """The command that goes on with a run, or with all seeds: with what was said since the run began, too."""
-    words: list[Any] = ["segvisrl train --resume", "--runs-dir", config.runs_dir, "--run", config.run_name]
+    words: list[Any] = ["segvisrl", "train", "--resume", "--runs-dir", config.runs_dir, "--run", config.run_name]
     if config.num_seeds > 1:
         words += ["--seed", config.seed, "--num-seeds", config.num_seeds]
     began = (config.resume and _stored_config(config.runs_dir, config.runs[0].run_name)) or config
@@ -73,7 +75,7 @@ def resume_command(config: TrainConfig) -> str:
         value = getattr(config, name)
         if value != getattr(began, name):
             words += [f"--{name.replace('_', '-')}", *(value if isinstance(value, tuple) else [value])]
-    return " ".join(map(str, words))
+    return shlex.join(map(str, words))
 
 
 def _end_now(said: str) -> None:
@@ -85,7 +87,7 @@ def _end_now(said: str) -> None:
 
 def parse_config(options: Sequence[str]) -> TrainConfig:
     """The resolved settings: preset, then options; a run that goes on starts from its own settings instead."""
-    words = [word for option in options for word in _split_equals(option)]
+    words = _without_auto([word for option in options for word in _as_tyro_reads(option)])
     arch, preset = _value(words, "--arch", "cnn_lstm"), _value(words, "--preset", "auto")
     if "--resume" in words:
         runs_dir, name = _value(words, "--runs-dir", "runs"), _value(words, "--run", "")
@@ -99,10 +101,8 @@ def parse_config(options: Sequence[str]) -> TrainConfig:
         should = "named where processes train together, e.g. gpu"
         require("--coordinator" not in words, "preset", "auto", should)  # JAX is not to be asked before they have met
         preset = preset_for_this_machine()
-        words = _without(words, "--preset")
     base = preset_config(arch, preset)
-    said = {word.replace("_", "-") for word in words}
-    if "--env.scene.num-rocks" in said and "--env.scene.random-num-rocks-max" not in said:
+    if "--env.scene.num-rocks" in words and "--env.scene.random-num-rocks-max" not in words:
         base = replace_fields(base, random_num_rocks_max=0, rocks=None)  # what is said counts, not the preset's choice
     return parse(TrainConfig, words, "train", base)
 
@@ -129,8 +129,12 @@ def preset_for_this_machine() -> PresetName:
     return "cpu" if jax.default_backend() == "cpu" else "gpu"
 
 
-def _split_equals(word: str) -> list[str]:
-    return word.split("=", 1) if word.startswith("--") and "=" in word else [word]
+def _as_tyro_reads(word: str) -> list[str]:
+    """``--some_option=value`` as ``--some-option``, ``value``."""
+    if not word.startswith("--"):
+        return [word]
+    option, equals, value = word.partition("=")
+    return [option.replace("_", "-"), *([value] if equals else [])]
 
 
 def _value(words: Sequence[str], option: str, default: str) -> str:
@@ -139,25 +143,22 @@ def _value(words: Sequence[str], option: str, default: str) -> str:
     return words[found[-1] + 1] if found else default
 
 
-def _without(words: list[str], option: str) -> list[str]:
-    if option not in words:
-        return words
-    i = words.index(option)
-    return _without(words[:i] + words[i + 2 :], option)
+def _without_auto(words: list[str]) -> list[str]:
+    """Without ``--preset auto``, which is what is meant where no preset is said."""
+    pair = ["--preset", "auto"]
+    found = next((i for i in range(len(words) - 1) if words[i : i + 2] == pair), None)
+    return words if found is None else _without_auto(words[:found] + words[found + 2 :])
 
 
 def differences_from_paper(config: TrainConfig) -> str:
     """One block: what of these settings is not the paper's."""
     paper = flatten(to_dict(preset_config(config.arch, "paper")))
     ours = flatten(to_dict(config))
-    bookkeeping = (
-        "seed", "run", "runs_dir", "resume", "preset", "checkpoint_every_updates", "max_bad_updates", "loggers",
-        "num_seeds", "num_devices", "coordinator", "num_processes", "process_id",
-    )  # fmt: skip
+    apart = (*BOOKKEEPING, "seed", "preset")
     rows = [
         f"  {name:<34} {_short(value):>12}   paper {_short(paper[name])}"
         for name, value in ours.items()
-        if value != paper[name] and name not in bookkeeping and not name.startswith("evaluation.")
+        if value != paper[name] and name not in apart and not name.startswith("evaluation.")
     ]
     title = f"{config.arch}, preset {config.preset}, seed {config.seed}: "
     if not rows:
@@ -228,4 +229,5 @@ def _finish(config: TrainConfig, run_dir: Path) -> None:
     print(f"\n{episodes} test scenes: {report_line(result)}")
     for name in ("config.json", "metrics.jsonl", "eval.json", "learning_curve.png", "rollout.mp4", "policy/"):
         print(f"  {run_dir / name}")
-    print(f"Next: segvisrl eval --run {run_dir} --episodes 1000    or    segvisrl demo --run {run_dir} --scene 1")
+    named = shlex.quote(str(run_dir))
+    print(f"Next: segvisrl eval --run {named} --episodes 1000    or    segvisrl demo --run {named} --scene 1")

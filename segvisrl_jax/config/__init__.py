@@ -7,7 +7,7 @@ Nothing here depends on JAX or MuJoCo.
 from segvisrl_jax.config.checks import ConfigError, is_finite, is_plain_text, one_line, read_json, require
 from segvisrl_jax.config.conditions import ConditionsConfig
 from segvisrl_jax.config.environment import CameraConfig, EnvConfig, PhysicsConfig, SceneConfig, TaskConfig
-from segvisrl_jax.config.learning import EvaluationConfig, NetworkConfig, PPOConfig, TrainConfig
+from segvisrl_jax.config.learning import BOOKKEEPING, EvaluationConfig, NetworkConfig, PPOConfig, TrainConfig
 from segvisrl_jax.config.names import (
     ARCH_OBSERVATION,
     IMAGE_OBSERVATIONS,
@@ -20,10 +20,11 @@ from segvisrl_jax.config.names import (
 )
 from segvisrl_jax.config.paths import require_file_can_be_written, require_folder_can_be_made
 from segvisrl_jax.config.presets import preset_config
-from segvisrl_jax.config.tree import flatten, from_dict, replace_fields, to_dict
+from segvisrl_jax.config.tree import flatten, from_dict, option_words, replace_fields, to_dict
 
 __all__ = [
     "ARCH_OBSERVATION",
+    "BOOKKEEPING",
     "IMAGE_OBSERVATIONS",
     "Arch",
     "CameraConfig",
@@ -47,6 +48,7 @@ __all__ = [
     "is_finite",
     "is_plain_text",
     "one_line",
+    "option_words",
     "preset_config",
     "read_json",
     "replace_fields",

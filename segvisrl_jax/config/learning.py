@@ -145,6 +145,13 @@ class EvaluationConfig:
         require(self.rocks is None or self.rocks >= 0, f"{p}.rocks", self.rocks, "0 or more, or None")
 
 
+BOOKKEEPING = (
+    "run", "runs_dir", "resume", "loggers", "checkpoint_every_updates", "max_bad_updates", "num_seeds", "num_devices",
+    "coordinator", "num_processes", "process_id",
+)  # fmt: skip
+"""Fields of ``TrainConfig`` that say where, how safely and on what a run is made, and not what is learnt."""
+
+
 @dataclass(frozen=True)
 class TrainConfig:
     """One training run."""

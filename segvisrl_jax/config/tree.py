@@ -56,6 +56,19 @@ def to_dict(config: Any) -> dict[str, Any]:
     return {name: list(v) if isinstance(v, tuple) else v for name, v in _shallow(config)}
 
 
+def option_words(name: str, value: Any) -> list[str]:
+    """A setting as the command line takes it: ``--env.camera.scale 20``, ``--network.no-bounded-mean``.
+
+    Args:
+        name: its full name, as ``flatten`` gives it.
+        value: plain JSON data, as ``to_dict`` gives it.
+    """
+    part, dot, last = name.replace("_", "-").rpartition(".")
+    if isinstance(value, bool):
+        return [f"--{part}{dot}{'' if value else 'no-'}{last}"]
+    return [f"--{part}{dot}{last}", *map(str, value if isinstance(value, list) else [value])]
+
+
 def _shallow(config: Any) -> list[tuple[str, Any]]:
     fields = [(f.name, getattr(config, f.name)) for f in dataclasses.fields(config)]
     return [(name, to_dict(v) if dataclasses.is_dataclass(v) else v) for name, v in fields]

@@ -14,7 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from segvisrl_jax.config import IMAGE_OBSERVATIONS, ConfigError, TrainConfig, replace_fields, require, to_dict
+from segvisrl_jax.config import (
+    IMAGE_OBSERVATIONS,
+    ConfigError,
+    TrainConfig,
+    is_finite,
+    replace_fields,
+    require,
+    to_dict,
+)
 from segvisrl_jax.machine.finding import GIB
 from segvisrl_jax.machine.memory import need_of, there_is
 
@@ -45,7 +53,8 @@ class GrowthSizes:
     """Points that should take more memory are not run; None: four fifths of what is free."""
 
     def __post_init__(self) -> None:
-        require(self.most_seconds > 0, "--growth.most-seconds", self.most_seconds, "above 0")
+        is_time = is_finite(self.most_seconds) and self.most_seconds > 0
+        require(is_time, "--growth.most-seconds", self.most_seconds, "above 0, and finite")
         require(self.most_gib is None or self.most_gib > 0, "--growth.most-gib", self.most_gib, "above 0")
 
 

@@ -5,7 +5,6 @@ time counts. Needs the extra ``[sb3]``.
 """
 
 import functools
-import os
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -20,6 +19,7 @@ from torch import nn
 
 from segvisrl_jax.adapters.stable_baselines3 import LunarRoverVecEnv
 from segvisrl_jax.config import ConfigError, NetworkConfig, TrainConfig, replace_fields
+from segvisrl_jax.cpu import num_cores
 from segvisrl_jax.env.rover_env import observation_shape
 from segvisrl_jax.machine.speed import learning_row
 from segvisrl_jax.training.loop import Trainer
@@ -41,7 +41,7 @@ def peer_rows(preset: TrainConfig, repeats: int, scales: Sequence[float] = SCALE
     Yields:
         Rows with what was measured, ours, theirs, and the ratio.
     """
-    torch.set_num_threads(os.cpu_count() or 1)
+    torch.set_num_threads(num_cores())
     for scale in scales:
         few = {"num_envs": FEW_ENVS, "num_minibatches": FEW_MINIBATCHES, "num_epochs": 1}
         config = replace_fields(preset, scale=scale, kl_stop=0.0, **few)

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from segvisrl_jax.cpu import num_cores
 from segvisrl_jax.machine.finding import GIB, Finding
 from segvisrl_jax.machine.programs import programs_folder
 
@@ -20,7 +21,7 @@ BUSY_SHARE = 0.5  # of the cores: above it, what is measured here is not what th
 def look(runs_dir: Path, cgroup: Path = CGROUP) -> Iterator[Finding]:
     """Cores, load, memory, and the disk that runs are written to."""
     usable = usable_cores(cgroup)
-    yield _cores(os.cpu_count() or 1, usable)
+    yield _cores(os.cpu_count() or 1, num_cores(), usable)
     yield from _load(usable)
     yield _memory(free_memory_bytes(cgroup))
     yield _disk(runs_dir)
@@ -29,9 +30,7 @@ def look(runs_dir: Path, cgroup: Path = CGROUP) -> Iterator[Finding]:
 
 def usable_cores(cgroup: Path = CGROUP) -> float:
     """Cores that the scheduler and a container's quota leave to this process; may be a fraction."""
-    has_affinity = hasattr(os, "sched_getaffinity")
-    allowed: float = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
-    return min(allowed, _quota(cgroup) or allowed)
+    return min(num_cores(), _quota(cgroup) or num_cores())
 
 
 def _quota(cgroup: Path) -> float | None:
@@ -103,11 +102,13 @@ def _read(path: Path) -> str | None:
         return None
 
 
-def _cores(present: int, usable: float) -> Finding:
-    if usable >= present:
-        return Finding(SECTION, "cores", str(present))
-    remedy = f"Physics takes a thread for each core that is there: add --env.physics.num-threads {max(1, int(usable))}."
-    return Finding(SECTION, "cores", f"{present}, of which this process may use {usable:g}", "note", remedy)
+def _cores(present: int, allowed: int, usable: float) -> Finding:
+    """``allowed``: those on which the scheduler lets this process run; a container's quota may leave it less time."""
+    text = str(present) if usable >= present else f"{present}, of which this process may use {usable:g}"
+    if usable >= allowed:
+        return Finding(SECTION, "cores", text)
+    remedy = f"Physics takes a thread for each of {allowed} cores: add --env.physics.num-threads {max(1, int(usable))}."
+    return Finding(SECTION, "cores", text, "note", remedy)
 
 
 def _load(usable: float) -> Iterator[Finding]:

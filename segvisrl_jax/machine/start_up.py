@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from segvisrl_jax.config import ConfigError
 from segvisrl_jax.machine.programs import FOLDER_VARIABLE
 
 NUM_UPDATES = 4
@@ -30,7 +31,7 @@ def start_rows(arch: str, preset: str) -> Iterator[dict[str, Any]]:
         difference: what comes before learning. The size of the folder in MB.
 
     Raises:
-        RuntimeError: where the training ends before it has made ``NUM_UPDATES`` updates; the message is its last line.
+        ConfigError: where the training ends, or time is over, before ``NUM_UPDATES`` updates; with its last line.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -68,7 +69,8 @@ def _ends_of_updates(command: list[str], environment: dict[str, str], run_dir: P
             process.send_signal(signal.SIGINT)
             process.wait()
     if len(ends) < NUM_UPDATES:
-        raise RuntimeError(f"training ended early: {log.read_text().strip().splitlines()[-1:]}")
+        said = log.read_text().strip().splitlines() or ["it said nothing"]
+        raise ConfigError(f"segvisrl train made {len(ends)} of {NUM_UPDATES} updates: {said[-1]}")
     return ends
 
 

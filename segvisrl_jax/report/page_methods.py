@@ -50,13 +50,13 @@ class ComparedMethod:
 
     @property
     def paper(self) -> PaperResult | None:
-        """What the paper reports of it, if it is in the paper and learnt there."""
-        return PAPER.get(self.kind)
+        """What the paper reports of it, if it is in the paper and learnt there, and these are the paper's scenes."""
+        return PAPER.get(self.kind) if self.row.median.is_in_the_papers_scenes else None
 
     @property
     def failed_in_paper(self) -> bool:
-        """Whether the paper says that it did not learn."""
-        return self.kind in PAPER and PAPER[self.kind] is None
+        """Whether the paper says that it did not learn, in the paper's scenes."""
+        return self.row.median.is_in_the_papers_scenes and self.kind in PAPER and PAPER[self.kind] is None
 
     @property
     def outcome(self) -> Int[np.ndarray, "E"]:

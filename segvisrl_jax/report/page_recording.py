@@ -1,5 +1,6 @@
 """Recordings for the report page: the few episodes that it shows, driven again with all their states kept."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from typing import Any
 import jax
 from jaxtyping import PRNGKeyArray
 
-from segvisrl_jax.config import IMAGE_OBSERVATIONS, EnvConfig, TrainConfig
+from segvisrl_jax.config import IMAGE_OBSERVATIONS, CameraConfig, EnvConfig, TrainConfig
 from segvisrl_jax.env.rover_env import RoverEnv
 from segvisrl_jax.report.episode import Episode, EpisodeView, drive_episodes
 from segvisrl_jax.training.policy import Policy
@@ -47,7 +48,7 @@ class Recordings:
     """Episodes by driver and scene.
 
     Args:
-        drivers: all with different names, of one camera, in one world.
+        drivers: all with different names, in one world.
         stream: of the test scenes.
     """
 
@@ -55,7 +56,7 @@ class Recordings:
         self.drivers: Mapping[str, Driver] = {driver.name: driver for driver in drivers}
         self._stream = stream
         self._episodes: dict[tuple[str, int], Episode] = {}
-        self._view = EpisodeView(drivers[0].env)
+        self._views: dict[CameraConfig, EpisodeView] = {}  # by the whole image of a camera
 
     def record(self, name: str, scenes: Sequence[int]) -> None:
         """Lets one driver drive numbered scenes."""
@@ -65,8 +66,12 @@ class Recordings:
             self._episodes |= {(name, number): episode for number, episode in zip(numbers, driven, strict=True)}
 
     def view(self, name: str) -> EpisodeView:
-        """Draws moments of a driver's episodes. All share one camera, and what is compiled for it."""
-        return self._view.of(self.drivers[name].env)
+        """Draws moments of a driver's episodes. Drivers of one camera share what is compiled for it."""
+        env = self.drivers[name].env
+        whole = dataclasses.replace(env.config.camera, scale=1.0)
+        if whole not in self._views:
+            self._views[whole] = EpisodeView(env)
+        return self._views[whole].of(env)
 
     def __getitem__(self, key: tuple[str, int]) -> Episode:
         """The episode of a driver's name and a scene."""

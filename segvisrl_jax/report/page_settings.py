@@ -3,9 +3,10 @@
 import shlex
 from typing import Any, NamedTuple
 
-from segvisrl_jax.config import TrainConfig, flatten, preset_config, to_dict
+from segvisrl_jax.config import BOOKKEEPING, TrainConfig, flatten, option_words, preset_config, to_dict
 
-NOT_SETTINGS = ("run", "runs_dir", "resume", "arch", "preset", "seed")
+NOT_SETTINGS = (*BOOKKEEPING, "arch", "preset", "seed")
+ROCKS, RANDOM_ROCKS = "env.scene.num_rocks", "env.scene.random_num_rocks_max"
 
 
 class Setting(NamedTuple):
@@ -43,16 +44,10 @@ def train_command(config: TrainConfig, run: str) -> str:
     """
     preset = flatten(to_dict(preset_config(config.arch, config.preset)))
     words = ["segvisrl", "train", "--arch", config.arch, "--preset", config.preset, "--seed", str(config.seed)]
-    for name, value in flatten(to_dict(config)).items():
-        if name not in NOT_SETTINGS and value != preset[name]:
-            words += _option(name, value)
+    values = flatten(to_dict(config))
+    said = [name for name, value in values.items() if name not in NOT_SETTINGS and value != preset[name]]
+    if ROCKS in said and RANDOM_ROCKS not in said:
+        said.append(RANDOM_ROCKS)  # a number of rocks that is said alone takes its place
+    for name in said:
+        words += option_words(name, values[name])
     return shlex.join([*words, "--run", run])
-
-
-def _option(name: str, value: Any) -> list[str]:
-    """As the command line takes it."""
-    part, dot, last = name.replace("_", "-").rpartition(".")
-    if isinstance(value, bool):
-        return [f"--{part}{dot}{'' if value else 'no-'}{last}"]
-    values = value if isinstance(value, list) else [value]
-    return [f"--{part}{dot}{last}", *map(str, values)]

@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from segvisrl_jax.config import TrainConfig, flatten, to_dict
+from segvisrl_jax.config import BOOKKEEPING, TrainConfig, flatten, to_dict
 
-BOOKKEEPING = ("seed", "run", "runs_dir", "resume", "checkpoint_every_updates", "loggers", "evaluation")
+NOT_LEARNT_FROM = (*BOOKKEEPING, "seed", "evaluation")
 WHO_COMPUTES = ("env.renderer", "env.physics.engine", "env.physics.num_threads")
 
 
@@ -13,5 +13,5 @@ def recipe(config: TrainConfig) -> dict[str, Any]:
 
     Seed, bookkeeping and the choice of the best policy are left out, and who computes what is the same.
     """
-    kept = {name: value for name, value in to_dict(config).items() if name not in BOOKKEEPING}
+    kept = {name: value for name, value in to_dict(config).items() if name not in NOT_LEARNT_FROM}
     return {name: value for name, value in flatten(kept).items() if name not in WHO_COMPUTES}

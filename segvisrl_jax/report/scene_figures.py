@@ -11,7 +11,7 @@ from matplotlib.patches import Circle, Patch
 from matplotlib.ticker import MultipleLocator
 
 from segvisrl_jax.report import layout
-from segvisrl_jax.report.figures import DOTS_PER_INCH, cycle_colours, save_figure
+from segvisrl_jax.report.figures import DOTS_PER_INCH, save_figure
 from segvisrl_jax.report.layout import DrivenPath, SceneMap
 from segvisrl_jax.types import Outcome
 from segvisrl_jax.vision.classes import CLASS_NAMES, PALETTE
@@ -28,28 +28,6 @@ PANELS_IN_ROW = 3
 MARGIN_M = 0.8  # around all that was driven
 TICK_M = 5.0
 X_LABEL, Y_LABEL = "x, forward from the start [m]", "y, to the left [m]"
-
-
-def trajectories(scene: SceneMap, paths: Sequence[DrivenPath], path_png: Path, title: str = "") -> Path:
-    """Draws one scene from above, and where rovers drove in it.
-
-    Args:
-        scene: map, rocks with the circle in which it collides, goal with the circle that counts.
-        paths: each with its label and outcome.
-        path_png: the figure.
-        title: what stands on top.
-    """
-    figure = Figure(figsize=(10.5, 8), layout="compressed")
-    axes = figure.add_subplot()
-    draw_scene(axes, scene)
-    for path, colour in zip(paths, cycle_colours(layout.PATHS, len(paths)), strict=True):
-        draw_path(axes, path, colour)
-    reach = scene.map_half_size_m * 1.04
-    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
-    axes.set(xlabel=X_LABEL, ylabel=Y_LABEL)
-    axes.set_title(title, fontsize=13)
-    figure.legend(loc="outside right upper", frameon=False)
-    return save_figure(figure, path_png)
 
 
 def draw_path(axes: Axes, path: DrivenPath, colour: str, line_style: str = "-") -> None:

@@ -30,7 +30,7 @@ AXIS_NAMES = {
     "camera.scale": "downsampling of the 1920 x 1080 image, per axis",
 }
 UNITS = {"_m_s2": "m/s²", "_m_s": "m/s", "_m": "m", "_s": "s", "_deg": "°", "_px": "px", "_per_m": "1/m"}
-OF_THE_WORLD = ("scene.", "task.", "physics.")
+OF_THE_WORLD = ("scene.", "task.", "physics.", "conditions.")
 NOT_OF_THE_WORLD = ("physics.engine", "physics.num_threads", "physics.timestep_s")
 """Settings of those parts that a method may have of its own, as it may have its rewards and its camera."""
 MOST_TICKS = 12

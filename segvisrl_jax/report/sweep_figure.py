@@ -14,6 +14,7 @@ from segvisrl_jax.report.figures import RUN_COLOURS, clear_frame, cycle_colours,
 
 SEED = "seed"  # runs that differ in nothing else are averaged
 SHIFT_SHARE = 0.12  # of the distance between neighbours on the axis: lines stand side by side, not on top of each other
+MOST_SHARE = 0.8  # that all lines together take of it
 
 
 def sweep_figure(rows: Sequence[Mapping[str, Any]], varied: Sequence[str], path_png: Path) -> Path:
@@ -35,11 +36,12 @@ def sweep_figure(rows: Sequence[Mapping[str, Any]], varied: Sequence[str], path_
     ticks = sorted({row[over] for row in rows}, key=_sort_key)
     others = [name for name in varied if name not in (over, SEED)]
     groups = sorted({tuple(row[name] for name in others) for row in rows}, key=lambda group: [*map(_sort_key, group)])
+    shift = min(SHIFT_SHARE, MOST_SHARE / len(groups))
     figure = Figure(figsize=(11, 4.8), layout="constrained")
     success, speed = figure.subplots(1, 2)
     for index, (group, colour) in enumerate(zip(groups, cycle_colours(RUN_COLOURS, len(groups)), strict=True)):
         members = [row for row in rows if tuple(row[name] for name in others) == group]
-        at = np.array([ticks.index(row[over]) for row in members]) + SHIFT_SHARE * (index - (len(groups) - 1) / 2)
+        at = np.array([ticks.index(row[over]) for row in members]) + shift * (index - (len(groups) - 1) / 2)
         label = ", ".join(_named(name, value) for name, value in zip(others, group, strict=True))
         _draw_success(success, members, at, colour)
         _draw_line(speed, at, np.array([row["decisions_per_second"] for row in members]), colour, label)

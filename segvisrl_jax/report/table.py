@@ -84,6 +84,11 @@ class Evaluation:
         return f"{columns} x {rows}" if self.renderer else None
 
     @property
+    def is_in_the_papers_scenes(self) -> bool:
+        """Whether goals and rocks are as in the paper: 4 rocks, and so on."""
+        return self.config.scene == SceneConfig()
+
+    @property
     def preset(self) -> str | None:
         """Preset of the training."""
         return str(self.training_config["preset"]) if self.training_config else None
@@ -244,7 +249,7 @@ def _columns(rows: Sequence[Row], shown: Sequence[str], baselines: Sequence[Eval
         columns["mcnemar"] = lambda row: _mcnemar_cell(row.median, baselines)
     if rows[0].median.episodes >= PAPER_TRIALS:
         columns["trials"] = lambda row: _trials_cell(row.median)
-    if rows[0].median.config.scene == SceneConfig():  # the paper's scenes
+    if rows[0].median.is_in_the_papers_scenes:
         columns["paper"] = lambda row: _paper_cell(PAPER[m]) if (m := row.median.method) in PAPER else NONE
     return columns
 

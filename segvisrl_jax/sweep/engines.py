@@ -39,9 +39,7 @@ class Ended(NamedTuple):
 
 def run_local(trials: Sequence[Trial], output: Path, jobs: int) -> Iterator[tuple[Trial, Ended]]:
     """Runs trials in processes of this machine, ``jobs`` at a time, and yields each as it ends."""
-    environment = dict(os.environ)
-    if jobs > 1:
-        environment.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", f"{GPU_SHARE / jobs:.3f}")
+    environment = sharing_a_gpu(1 / jobs)
     pool = ThreadPoolExecutor(jobs)
     waiting = {pool.submit(train_in, output, trial, environment): trial for trial in trials}
     try:
@@ -51,7 +49,15 @@ def run_local(trials: Sequence[Trial], output: Path, jobs: int) -> Iterator[tupl
         pool.shutdown(cancel_futures=True)  # after Ctrl-C the processes, which heard it too, save and end
 
 
-def train_in(folder: Path, trial: Trial, environment: dict[str, str] | None = None) -> int:
+def sharing_a_gpu(share: float) -> dict[str, str]:
+    """The environment of a run that has this share of a GPU: JAX would take three quarters of its memory."""
+    environment = dict(os.environ)
+    if 0 < share < 1:
+        environment.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", f"{GPU_SHARE * share:.3f}")
+    return environment
+
+
+def train_in(folder: Path, trial: Trial, environment: dict[str, str]) -> int:
     """Trains one trial in ``folder`` to its end, from its last checkpoint where there is one; the exit code."""
     words = ["--run", trial.name, "--runs-dir", str(folder)]
     words = [*words, "--resume"] if (folder / trial.name / "config.json").is_file() else [*trial.words, *words]
@@ -86,7 +92,7 @@ def run_ray(
     marker = output / MARKER
     marker.write_text(word)
     task = ray.remote(num_cpus=num_cpus, num_gpus=num_gpus)(train_on_node)
-    waiting = {task.remote(trial, str(output.resolve()), word): trial for trial in trials}
+    waiting = {task.remote(trial, str(output.resolve()), word, num_gpus): trial for trial in trials}
     try:
         while waiting:
             [reference], _ = ray.wait(list(waiting), num_returns=1)
@@ -131,14 +137,14 @@ def _receive(ray: Any, reference: Any, output: Path) -> Ended:
     return ended
 
 
-def train_on_node(trial: Trial, output: str, word: str) -> tuple[Ended, bytes]:
+def train_on_node(trial: Trial, output: str, word: str, num_gpus: float) -> tuple[Ended, bytes]:
     """What a node of the cluster does: trains, and packs the run where it does not see the sweep's folder."""
-    marker = Path(output) / MARKER
+    marker, environment = Path(output) / MARKER, sharing_a_gpu(num_gpus)
     node = _node_name()
     if marker.is_file() and marker.read_text() == word:
-        return Ended(train_in(Path(output), trial), node), b""
+        return Ended(train_in(Path(output), trial, environment), node), b""
     with tempfile.TemporaryDirectory() as folder:
-        code = train_in(Path(folder), trial)
+        code = train_in(Path(folder), trial, environment)
         return Ended(code, node), pack(Path(folder))
 
 

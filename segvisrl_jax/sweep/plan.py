@@ -11,9 +11,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from segvisrl_jax.config import ConfigError, TrainConfig, flatten, read_json, require, to_dict
+from segvisrl_jax.config import ConfigError, TrainConfig, flatten, option_words, read_json, require, to_dict
 
 NOT_COMPARED = ("run", "runs_dir", "resume", "loggers")  # what a run that goes on may have otherwise
+FLAGS = {"True": True, "true": True, "False": False, "false": False}
 BY_VALUE = ("arch", "preset")  # fields whose values say what they are: "cnn", not "archcnn"
 
 
@@ -100,11 +101,18 @@ def plan_trials(axes: Sequence[Axis], common: Sequence[str]) -> list[Trial]:
 def _trial(axes: Sequence[Axis], values: Sequence[str], common: Sequence[str]) -> Trial:
     words, parts = list(common), []
     for axis, value in zip(axes, values, strict=True):
-        words += ["--" + axis.field.replace("_", "-"), *value.split()]
+        words += option_words(axis.field, _typed(axis.field, value))
         plain = re.sub(r"[^\w.+-]+", "_", value)
         parts.append(plain if axis.field in BY_VALUE else axis.label + plain)
     labels = [axis.label for axis in axes]
     return Trial("-".join(parts), dict(zip(labels, values, strict=True)), tuple(words))
+
+
+def _typed(field: str, value: str) -> bool | list[str]:
+    """A value's words; True or False where the setting is one of the two."""
+    is_flag = isinstance(flatten(to_dict(TrainConfig()))[field], bool)
+    require(not is_flag or value in FLAGS, f"--vary {field}", value, "True or False")
+    return FLAGS[value] if is_flag else value.split()
 
 
 def check_trials(
@@ -127,6 +135,8 @@ def check_trials(
             config = parse_config([*trial.words, "--run", trial.name, "--runs-dir", str(output)])
         except ConfigError as error:
             raise ConfigError(f"{trial.name}: {error}") from None
+        only_one = "1; vary seed=0,1,2 instead, so that each has a folder of its own"
+        require(config.num_seeds == 1, f"{trial.name}: num_seeds", config.num_seeds, only_one)
         _check_same_settings(config, output / trial.name / "config.json")
         configs.append(config)
     return configs

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from segvisrl_jax.agent.networks import Params
-from segvisrl_jax.config import ConfigError, TrainConfig, flatten, one_line, read_json, to_dict
+from segvisrl_jax.config import BOOKKEEPING, ConfigError, TrainConfig, flatten, one_line, read_json, to_dict
 from segvisrl_jax.training.checkpoint import Checkpoints, save_policy
 from segvisrl_jax.training.manifest import replace_file
 from segvisrl_jax.training.metrics import MetricsWriter
@@ -25,11 +25,8 @@ from segvisrl_jax.training.trackers import open_trackers
 from segvisrl_jax.types import Outcome
 
 RECENT_EPISODES = 200  # what the progress bar's shares are taken over
-FREE_ON_RESUME = (  # not evaluation.rocks and .episodes: the best policy so far was judged by them
-    "steps", "resume", "runs_dir", "run", "evaluation.every_decisions", "evaluation.num_slots", "preset", "loggers",
-    "checkpoint_every_updates", "max_bad_updates", "num_devices", "num_seeds", "coordinator", "num_processes",
-    "process_id",
-)  # fmt: skip
+# Not evaluation.rocks and evaluation.episodes: the best policy so far was judged by them.
+FREE_ON_RESUME = (*BOOKKEEPING, "steps", "preset", "evaluation.every_decisions", "evaluation.num_slots")
 OUTCOMES = (Outcome.SUCCESS, Outcome.COLLISION, Outcome.FALL, Outcome.TIMEOUT, Outcome.UNSTABLE)
 OURS = ("lock",)  # what may be in a folder that no run has begun in, besides half-written files
 

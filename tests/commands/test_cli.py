@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 
@@ -10,6 +11,7 @@ import pytest
 from segvisrl_jax.cli import main
 from segvisrl_jax.commands.train import parse_config, resume_command, rocks_in_scenes
 from segvisrl_jax.config import preset_config, replace_fields, to_dict
+from segvisrl_jax.cpu import num_cores
 from segvisrl_jax.training.run import open_run_dir
 
 PROGRAM = [sys.executable, "-m", "segvisrl_jax.cli"]
@@ -185,7 +187,7 @@ def test_bench_prints_a_table_and_writes_the_same_numbers(tmp_path):
     assert all(row.get("frames_per_s", row.get("decisions_per_s")) > 0 for row in result["rows"])
     assert done.stdout.count("| scanline | 1920 x 1080 to 16 x 9 | 4 |") == 2
     assert result["command"].startswith("segvisrl bench physics render")
-    assert result["machine"]["cores"] == os.cpu_count()
+    assert result["machine"]["cores"] == num_cores()
 
 
 @pytest.mark.slow
@@ -242,7 +244,7 @@ def test_a_run_that_was_moved_goes_on_where_it_is(tmp_path, monkeypatch):
     assert (goes_on.runs_dir, goes_on.run, goes_on.seed) == ("runs", "moved", 3)
     assert resume_command(goes_on) == "segvisrl train --resume --runs-dir runs --run moved"
     longer = parse_config(["--resume", "--run", "moved", "--steps", "99999", "--loggers", "wandb", "mlflow"])
-    assert parse_config(resume_command(longer).split()[2:]) == longer
+    assert parse_config(shlex.split(resume_command(longer))[2:]) == longer
 
 
 @pytest.mark.parametrize(
@@ -262,10 +264,23 @@ def test_a_number_of_rocks_that_is_said_counts(said, rocks):
     assert rocks_in_scenes(config) == f"  rocks: {rocks}"
 
 
+def test_words_mean_the_same_however_they_are_written(tmp_path):
+    runs = tmp_path / "my runs"
+    began = parse_config(
+        ["--arch", "mlp", "--preset", "auto", "--preset", "smoke", "--runs-dir", str(runs), "--run", "1e3"]
+    )
+    assert (began.preset, began.run, began.steps) == ("smoke", "1e3", 512)
+    open_run_dir(began)
+    goes_on = parse_config(["--resume", "--preset", "auto", f"--runs_dir={runs}", "--run", "1e3"])
+    assert goes_on == replace_fields(began, resume=True)
+    assert parse_config(shlex.split(resume_command(goes_on))[2:]) == goes_on
+    assert parse_config(["--preset", "smoke", "--steps", "1e3"]).steps == 1000
+
+
 def test_the_command_that_goes_on_with_seeds_means_all_of_them(tmp_path):
     words = ["--arch", "mlp", "--preset", "smoke", "--runs-dir", str(tmp_path), "--run", "run", "--seed", "3"]
     together = parse_config([*words, "--num-seeds", "2"])
     for each in together.runs:
         open_run_dir(each)
-    goes_on = parse_config(resume_command(together).split()[2:])
+    goes_on = parse_config(shlex.split(resume_command(together))[2:])
     assert goes_on == replace_fields(together, resume=True)

@@ -99,8 +99,7 @@ def test_sections_stand_in_their_order_and_say_what_was_driven(page):
     assert "4 episodes of the trained policies failed; shown are 2" in words
     assert "What went wrong" in words
     assert "27.0" not in words
-    assert "90.0 74.4 to 96.5" in words  # the paper's 27 of 30
-    assert "failed to learn" in words
+    assert "74.4 to 96.5" not in words  # the paper's 27 of 30, which were among 4 rocks
     assert "in 1 minutes" in words
     assert "env.task.max_decisions 5 100" in words
     assert "segvisrl eval --run" in words

@@ -1,16 +1,18 @@
 """A sweep trains what is missing, leaves finished runs alone, and says what failed: here, and on a Ray cluster."""
 
 import csv
+import io
 import json
 import os
 import subprocess
 import sys
+import tarfile
 from pathlib import Path
 
 import pytest
 
 from segvisrl_jax.cli import main
-from segvisrl_jax.sweep.engines import pack, train_on_node, unpack
+from segvisrl_jax.sweep.engines import pack, sharing_a_gpu, train_on_node, unpack
 from segvisrl_jax.sweep.plan import parse_axis, plan_trials
 
 TINY = ("--arch", "mlp", "--evaluation.episodes", "1", "--env.task.max-decisions", "10")
@@ -54,6 +56,8 @@ def test_sweep_goes_on_where_it_was_and_reports_failures(tmp_path):
     ("words", "said"),
     [
         (["--vary", "scal=20"], "did you mean scale"),
+        (["--vary", "num_seeds=2"], "num_seeds2: num_seeds = 2: should be 1; vary seed=0,1,2"),
+        (["--vary", "bounded_mean=yes,no"], "--vary network.bounded_mean = 'yes': should be True or False"),
         (["--vary", "scale=20,0.1"], "scale0.1: camera.scale = 0.1: should be 1 or more"),
         (["--jobs", "0"], "--jobs = 0: should be in [1, 1024]"),
         (["--args=--no-such-option"], "no-such-option"),
@@ -76,6 +80,24 @@ def test_packed_folders_come_back_whole_and_stay_inside(tmp_path):
     target.mkdir()
     unpack(pack(source), target)
     assert (target / "run" / "eval.json").read_text() == "{}"
+    made = io.BytesIO()
+    with tarfile.open(fileobj=made, mode="w:gz") as archive:
+        archive.addfile(tarfile.TarInfo("../outside"))
+    with pytest.raises(tarfile.OutsideDestinationError):
+        unpack(made.getvalue(), target)
+    assert not (tmp_path / "outside").exists()
+
+
+def test_what_is_on_or_off_can_be_varied():
+    on, off = plan_trials([parse_axis("bounded_mean=True,False")], [])
+    assert (on.name, on.words) == ("bounded_meanTrue", ("--network.bounded-mean",))
+    assert (off.name, off.words) == ("bounded_meanFalse", ("--network.no-bounded-mean",))
+
+
+def test_runs_that_share_a_gpu_share_its_memory(monkeypatch):
+    monkeypatch.delenv("XLA_PYTHON_CLIENT_MEM_FRACTION", raising=False)
+    assert float(sharing_a_gpu(0.25)["XLA_PYTHON_CLIENT_MEM_FRACTION"]) == pytest.approx(0.225)
+    assert all("XLA_PYTHON_CLIENT_MEM_FRACTION" not in sharing_a_gpu(share) for share in (0.0, 1.0, 2.0))
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +137,7 @@ def test_a_node_with_another_disk_sends_its_run_back(tmp_path, cluster):
     ray.init(address=cluster.address, log_to_driver=False, logging_level="ERROR")
     try:
         task = ray.remote(num_cpus=1)(train_on_node)
-        ended, packed = ray.get(task.remote(trial, "/no/such/folder", "word"))
+        ended, packed = ray.get(task.remote(trial, "/no/such/folder", "word", 0.0))
     finally:
         ray.shutdown()
     assert ended.code == 0

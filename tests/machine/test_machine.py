@@ -93,9 +93,11 @@ def test_a_containers_share_of_the_cores_counts(tmp_path, monkeypatch):
     assert resources.usable_cores(old) == 2
     (old / "cpu" / "cpu.cfs_quota_us").write_text("-1")
     assert resources.usable_cores(old) == 8
-    cores = resources._cores(8, 1.5)
+    cores = resources._cores(8, 8, 1.5)
     assert cores.mark == "note"
     assert "--env.physics.num-threads 1" in cores.remedy
+    few = resources._cores(8, 2, 2)  # two of eight: physics takes two threads by itself
+    assert (few.value, few.mark) == ("8, of which this process may use 2", "ok")
 
 
 def test_a_containers_limit_of_memory_counts(tmp_path):

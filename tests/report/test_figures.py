@@ -10,9 +10,8 @@ import pytest
 
 from segvisrl_jax.config import ConfigError
 from segvisrl_jax.report.figures import learning_curve, running_mean
-from segvisrl_jax.report.layout import DrivenPath, SceneMap
-from segvisrl_jax.report.scene_figures import preprocessing, trajectories
-from segvisrl_jax.types import Outcome
+from segvisrl_jax.report.layout import SceneMap
+from segvisrl_jax.report.scene_figures import preprocessing
 from segvisrl_jax.vision.classes import PALETTE
 
 
@@ -96,25 +95,6 @@ def scene_map(rocks=((1.0, 2.0), (-3.0, 0.5))):
     rocks = np.array(rocks, np.float32).reshape(-1, 2)
     radii = np.full(len(rocks), 0.2, np.float32)
     return SceneMap(np.array([-12.0, 0.0]), np.array([3.0, 4.0]), rocks, radii)
-
-
-def test_trajectories_shows_circles_paths_and_outcomes(tmp_path, drawn):
-    line = np.linspace([-12, 0], [2, 3.5], 30)
-    paths = [
-        DrivenPath("cnn_lstm", line, Outcome.SUCCESS),
-        DrivenPath("P controller", line[:20], Outcome.COLLISION),
-    ]
-    image = iio.imread(trajectories(scene_map(), paths, tmp_path / "scene.png", title="Scene 3"))
-    assert image.shape[1] >= 1000
-    figure = drawn[0]
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels[-2:] == ["cnn_lstm: success", "P controller: collision"]
-    radii = sorted(patch.get_width() / 2 for patch in figure.axes[0].patches[1:])
-    np.testing.assert_allclose(radii, [0.2, 0.2, 0.5, 0.5, 1.0], rtol=1e-6)
-
-
-def test_trajectories_without_rocks_or_paths(tmp_path):
-    trajectories(scene_map(rocks=()), [], tmp_path / "scene.png")
 
 
 def test_preprocessing_shows_every_step(tmp_path, drawn):

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from segvisrl_jax.commands.train import parse_config
 from segvisrl_jax.config import EnvConfig, preset_config, replace_fields, to_dict
+from segvisrl_jax.report.page import paper_shares
 from segvisrl_jax.report.page_figures import inline_svg, theme_colour
 from segvisrl_jax.report.page_methods import (
     closest_calls,
@@ -92,11 +93,22 @@ def test_methods_are_named_ranked_and_summed_up():
     assert [one.name for one in compared_methods([seeds[0], twice])] == ["mlp (m0)", "mlp (other)"]
 
 
+def test_the_paper_stands_beside_its_own_scenes_only():
+    ours = [evaluation("a", "cnn_lstm", "SS"), evaluation("m", "mlp", "SS"), evaluation("p", "p", "SS")]
+    methods = {one.name: one for one in compared_methods(ours)}
+    assert paper_shares(methods["cnn_lstm"].paper)["success"] == 0.9
+    assert [methods["mlp"].paper, methods["mlp"].failed_in_paper] == [None, True]
+    denser = compared_methods([replace(one, config=replace_fields(one.config, num_rocks=3)) for one in ours])
+    assert [(one.paper, one.failed_in_paper) for one in denser] == [(None, False)] * 3
+
+
 @pytest.mark.parametrize(
     ("arch", "preset", "changes"),
     [
         ("mlp", "cpu", {}),
         ("cnn_lstm", "gpu", {"learning_rate": 3e-4, "rocks": None, "bounded_mean": False, "steps": 1000}),
+        ("cnn_lstm", "cpu", {"num_rocks": 8}),
+        ("cnn_lstm", "cpu", {"num_rocks": 8, "random_num_rocks_max": 0}),
         ("mlp_rocks", "paper", {"mlp_sizes": (64, 32), "bounded_mean": True, "renderer": "gl", "seed": 7}),
     ],
 )

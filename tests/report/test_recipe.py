@@ -14,6 +14,8 @@ CONFIG = preset_config("cnn_lstm", "cpu")
         {"seed": 3},
         {"run": "other", "runs_dir": "elsewhere"},
         {"rocks": None, "episodes": 10},
+        {"num_devices": 2, "coordinator": "h:1", "num_processes": 2, "process_id": 1, "max_bad_updates": 3},
+        {"loggers": ("wandb",), "checkpoint_every_updates": 1, "resume": True},
         {"engine": "native", "num_threads": 2, "renderer": "gl"},
     ],
 )
