@@ -23,7 +23,7 @@ from segvisrl_jax.view.stage import rock_name
 IS_SCRIPT = "__file__" in globals()
 OUTPUT = Path(sys.argv[1]) if IS_SCRIPT and len(sys.argv) > 1 else Path("figures")
 OUTPUT.mkdir(parents=True, exist_ok=True)
-SCENE, NUM_ROCKS, DRIVEN_S = 5, 24, 34
+SCENE, NUM_ROCKS, DRIVEN_S = 28, 16, 27
 WINDOW_PX = (1480, 1000)
 SETTLING_S = 8  # for the last images to arrive, and for a processor to draw what a graphics card draws at once
 CLOSE_NOTE = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(one => one.click())"

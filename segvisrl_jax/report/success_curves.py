@@ -34,6 +34,7 @@ OF_THE_WORLD = ("scene.", "task.", "physics.", "conditions.")
 NOT_OF_THE_WORLD = ("physics.engine", "physics.num_threads", "physics.timestep_s")
 """Settings of those parts that a method may have of its own, as it may have its rewards and its camera."""
 MOST_TICKS = 12
+MOST_DISTINCTIONS = 2  # settings in the name of a line
 SIDE_SHARE = 0.04  # of an axis, free on both sides of the values
 ASIDE_PT = 4.0  # between methods, so that points at the same place are all seen
 
@@ -99,12 +100,22 @@ def lines_of(evaluations: Sequence[Evaluation], field: str) -> list[Line]:
     groups: dict[str, list[Evaluation]] = {}
     for evaluation in evaluations:
         groups.setdefault(_method_key(evaluation, field), []).append(evaluation)
-    methods = [group[0].method for group in groups.values()]
-    lines = []
-    for group in groups.values():
-        is_alone = methods.count(group[0].method) == 1
-        lines.append(_line(group, field, "" if is_alone else ", ".join(dict.fromkeys(map(_source, group)))))
-    return lines
+    firsts = [group[0] for group in groups.values()]
+    return [_line(group, field, _distinction(group, firsts, field)) for group in groups.values()]
+
+
+def _distinction(group: Sequence[Evaluation], firsts: Sequence[Evaluation], field: str) -> str:
+    """What tells a line from others of its method: its run; of several runs, the settings of their training if few."""
+    recipes = [first.recipe for first in firsts if first.method == group[0].method]
+    if len(recipes) == 1:
+        return ""
+    ours = group[0].recipe
+    differing = [name for name, value in ours.items() if any(other.get(name) != value for other in recipes)]
+    differing = [name for name in differing if name != f"env.{field}"]
+    sources = list(dict.fromkeys(map(_source, group)))
+    if len(sources) == 1 or not 1 <= len(differing) <= MOST_DISTINCTIONS:
+        return ", ".join(sources)
+    return ", ".join(f"{name.rpartition('.')[2]} {ours[name]}" for name in differing)
 
 
 def _require_same_world(first: Evaluation, other: Evaluation, field: str) -> None:

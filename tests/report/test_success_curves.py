@@ -95,6 +95,9 @@ def test_other_policies_are_other_lines_named_by_where_they_came_from():
         one.training_config["network"]["lstm_size"] = 7
     names = [line.name for line in lines_of([*ours, *other, *density()], "scene.num_rocks")]
     assert names == ["cnn (a)", "cnn_wide", "P controller"]
+    several = [dataclasses.replace(one, source=f"runs/{i}") for i, one in enumerate([*ours, *other])]
+    names = [line.name for line in lines_of([*several, *density()], "scene.num_rocks")]
+    assert names == ["cnn (lstm_size 256)", "cnn (lstm_size 7)", "P controller"]
 
 
 def test_other_worlds_are_refused_but_other_eyes_engines_and_rewards_are_not():
