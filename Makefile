@@ -38,6 +38,7 @@ $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "segvisrl_jax needs Python 3.11 or newer; set PYTHON=/path/to/python3.11"; exit 2; }
 	@echo "Setting up $(VENV) from requirements.lock (once)"
+	@test ! -e $(VENV) || test -f $(VENV)/pyvenv.cfg || { echo "$(VENV) is there and is no virtual environment; set VENV=folder"; exit 2; }
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV) || { rm -rf $(VENV); \
 	  echo "$(PYTHON) cannot make virtual environments (on Debian and Ubuntu: apt install python3-venv); see docs/troubleshooting.md"; exit 2; }
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
@@ -55,7 +56,7 @@ sb3: $(READY) ## add Stable-Baselines3 and PyTorch (0.9 GB for a CPU; PyPI's own
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check torch==2.13.0 stable-baselines3==2.9.2 sb3-contrib==2.9.2
 
 train: $(READY) ## train ARCH with PRESET, evaluate it, write runs/<name>/
-	@$(BIN)/segvisrl train --arch $(ARCH) --preset $(PRESET) --seed $(SEED) $(if $(STEPS),--steps $(STEPS)) $(if $(RUN),--run $(RUN)) $(ARGS)
+	@$(BIN)/segvisrl train $(if $(and $(RUN),$(findstring --resume,$(ARGS))),,--arch $(ARCH) --preset $(PRESET) --seed $(SEED)) $(if $(STEPS),--steps $(STEPS)) $(if $(RUN),--run $(RUN)) $(ARGS)
 
 eval: $(READY) ## drive EPISODES held-out scenes with runs/RUN, or POLICY=name
 	@$(BIN)/segvisrl eval $(if $(POLICY),--policy $(POLICY),--run $(if $(wildcard $(RUN)),$(RUN),runs/$(RUN))) --episodes $(EPISODES) --seed $(SEED) $(ARGS)

@@ -4,6 +4,7 @@ Every option comes from a dataclass (tyro). Nothing heavy is imported before it 
 """
 
 import contextlib
+import dataclasses
 import errno
 import importlib
 import io
@@ -137,10 +138,11 @@ def _config_error(error: BaseException | None) -> ConfigError | None:
 
 def _takes_text(kind: type, option: str) -> bool:
     """Whether what follows a word is a name or a path, which may look like a number."""
-    *parts, last = option.removeprefix("--").replace("-", "_").split(".")
-    for part in parts:
-        kind = typing.get_type_hints(kind).get(part, object)
-    hint = typing.get_type_hints(kind).get(last)
+    if not option.startswith("--"):
+        return False
+    hint: typing.Any = kind
+    for part in option.removeprefix("--").replace("-", "_").split("."):
+        hint = typing.get_type_hints(hint).get(part) if dataclasses.is_dataclass(hint) else None
     return bool({str, Path} & {hint, *typing.get_args(hint)})
 
 

@@ -108,11 +108,15 @@ def register(target: str, function: BatchFunction) -> None:
 
 def _call(function: BatchFunction, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
     """Calls it; Ctrl-C that comes meanwhile, in the main thread, is told again when it passes through Python alone."""
-    try:
-        function(arguments, results)
-    except KeyboardInterrupt:
+    is_done = is_interrupted = False
+    while not is_done:
+        try:
+            function(arguments, results)
+            is_done = True
+        except KeyboardInterrupt:
+            is_interrupted = True
+    if is_interrupted:
         threading.Timer(TOLD_AGAIN_S, _thread.interrupt_main).start()
-        function(arguments, results)
 
 
 def _answered_metadata(frame: CallFrame) -> bool:

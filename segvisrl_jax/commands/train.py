@@ -7,7 +7,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from segvisrl_jax.cli import FAILURE, INTERRUPTED, parse
 from segvisrl_jax.config import (
@@ -18,6 +18,7 @@ from segvisrl_jax.config import (
     TrainConfig,
     flatten,
     from_dict,
+    option_words,
     preset_config,
     read_json,
     replace_fields,
@@ -27,7 +28,10 @@ from segvisrl_jax.config import (
 )
 
 SHOW_CURSOR = "\x1b[?25h"
-SAID_AGAIN = ("steps", "checkpoint_every_updates", "max_bad_updates", "num_devices", "loggers")  # if changed on resume
+SAID_AGAIN = (  # where it was changed when the run went on
+    "steps", "evaluation.every_decisions", "evaluation.num_slots", "checkpoint_every_updates", "max_bad_updates",
+    "num_devices", "loggers",
+)  # fmt: skip
 TEST_EPISODES = 200  # driven after training, on scenes that neither training nor the choice of the policy saw
 
 
@@ -71,10 +75,8 @@ def resume_command(config: TrainConfig) -> str:
     if config.num_seeds > 1:
         words += ["--seed", config.seed, "--num-seeds", config.num_seeds]
     began = (config.resume and _stored_config(config.runs_dir, config.runs[0].run_name)) or config
-    for name in SAID_AGAIN:
-        value = getattr(config, name)
-        if value != getattr(began, name):
-            words += [f"--{name.replace('_', '-')}", *(value if isinstance(value, tuple) else [value])]
+    now, then = (flatten(to_dict(one)) for one in (config, began))
+    words += [word for name in SAID_AGAIN if now[name] != then[name] for word in option_words(name, now[name])]
     return shlex.join(map(str, words))
 
 
@@ -144,10 +146,10 @@ def _value(words: Sequence[str], option: str, default: str) -> str:
 
 
 def _without_auto(words: list[str]) -> list[str]:
-    """Without ``--preset auto``, which is what is meant where no preset is said."""
-    pair = ["--preset", "auto"]
-    found = next((i for i in range(len(words) - 1) if words[i : i + 2] == pair), None)
-    return words if found is None else _without_auto(words[:found] + words[found + 2 :])
+    """Without ``--preset auto``: it means that none is said, where it comes last, and nothing where another does."""
+    dropped = ("auto",) if _value(words, "--preset", "") != "auto" else (*get_args(PresetName), "auto")
+    places = [i for i, word in enumerate(words[:-1]) if word == "--preset" and words[i + 1] in dropped]
+    return [word for i, word in enumerate(words) if i not in places and i - 1 not in places]
 
 
 def differences_from_paper(config: TrainConfig) -> str:

@@ -195,7 +195,7 @@ def scene_map(env: RoverEnv, scene: Scene) -> SceneMap:
 def camera_view(env: RoverEnv, kind: ObservationKind) -> Callable[[RoverState], UInt8[Array, "H W 3"]]:
     """A jitted function from a state to the whole camera image, (360, 640, 3) uint8, in colour or segmented.
 
-    Under the scene's own conditions, but for those that are drawn for each frame anew.
+    Under the scene's own conditions, but for exposure and what is drawn for each frame anew.
     """
     size = {"width_px": VIEW_WIDTH_PX, "height_px": VIEW_HEIGHT_PX, "scale": 1.0}
     # Neutral conditions ask nothing of renderer or rocks that this image does not need.

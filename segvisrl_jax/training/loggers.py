@@ -141,6 +141,7 @@ class TensorBoard:
                 self._events = self._open()
             self._events.write_event(Event(wall_time=time.time(), step=step, summary=Summary(value=values)))
             self._events.flush()
+            self._purge_step = None  # once: a later file of this sitting hides nothing of it
         except OSError:
             self._events = None  # what is half written ends this file; the next numbers go to a new one
             raise
@@ -162,7 +163,6 @@ class TensorBoard:
         if self._purge_step is not None:
             began = SessionLog(status=SessionLog.START)
             events.write_event(Event(wall_time=time.time(), step=self._purge_step, session_log=began))
-            self._purge_step = None  # once: a later file of this sitting hides nothing of it
         return events
 
 

@@ -136,9 +136,9 @@ class Run:
         write = functools.partial(self._checkpoints.save, host.updates, state, dataclasses.asdict(host))
         if not self._is_alone:
             write()  # the others wait for this process: what fails here fails everywhere
-            self.num_saved = host.updates
+            self.num_saved = self._checkpoints.latest
         elif self._try(f"the checkpoint of update {host.updates}", write):
-            self.num_saved = host.updates
+            self.num_saved = self._checkpoints.latest
         self._write_policy()
 
     def not_on_disk(self, updates: int | None) -> list[str]:

@@ -58,12 +58,12 @@ def test_ends_are_told_as_it_wants_them():
     np.testing.assert_array_equal(first, envs.reset())
 
 
-@pytest.mark.slow
 def test_options_are_refused_as_there_are_none():
     with pytest.raises(ConfigError, match=r"options = \{'scene': 3\}: should be empty"):
         LunarRoverVecEnv(2, obs="state").set_options({"scene": 3})
 
 
+@pytest.mark.slow
 def test_its_evaluation_drives_whole_episodes():
     envs = VecMonitor(LunarRoverVecEnv(4, obs="state", max_decisions=5))
     returns, lengths = evaluate_policy(

@@ -52,6 +52,7 @@ def segvisrl(*words, cwd):
         (["eval", "--controller", "p", "--conditions.latency-s", "0.3"], ["latency_s", "0.3", "multiple of", "0.2"]),
         (["train", "--env.conditions.fog", "1"], ["--env.conditions.fog"]),
         (["eval", "--policy", "nowhere"], ["nowhere", "policy.json"]),
+        (["eval", "--json", "policy.json", "--policy", "nowhere"], ["nowhere", "policy.json"]),
         (["eval", "--run", "nowhere"], ["nowhere", "policy"]),
         (["demo", "--controller", "p", "--output", "x.avi"], ["--output", "x.avi", ".mp4"]),
         (["bench", "fly"], ["fly", "physics"]),
@@ -270,6 +271,8 @@ def test_words_mean_the_same_however_they_are_written(tmp_path):
         ["--arch", "mlp", "--preset", "auto", "--preset", "smoke", "--runs-dir", str(runs), "--run", "1e3"]
     )
     assert (began.preset, began.run, began.steps) == ("smoke", "1e3", 512)
+    assert parse_config(["--preset", "smoke", "--preset", "auto"]).preset == "cpu"
+    assert parse_config(["--run", "arch.x", "--seed", "1"]).run == "arch.x"
     open_run_dir(began)
     goes_on = parse_config(["--resume", "--preset", "auto", f"--runs_dir={runs}", "--run", "1e3"])
     assert goes_on == replace_fields(began, resume=True)
