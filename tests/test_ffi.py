@@ -1,5 +1,6 @@
 """NumPy functions called by name from compiled programs."""
 
+import signal
 import time
 import zlib
 
@@ -76,6 +77,15 @@ def wheels(engine, action):
     return wheel_command(action, engine._max_wheel_speed).reshape(-1, 4)
 
 
+@pytest.fixture
+def _python_hears_ctrl_c():
+    """As in a program: a worker of the test runner may ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("_python_hears_ctrl_c")
 def test_ctrl_c_in_a_function_comes_when_the_program_has_ended():
     calls = []
 
