@@ -88,9 +88,13 @@ class GlRenderer:
         return self._callback(self._draw_rgb, (*self._size, CHANNELS), scene, camera)
 
     def close(self) -> None:
-        """Frees OpenGL; what is drawn afterwards raises. Harmless when repeated."""
+        """Frees OpenGL and the model; what is drawn afterwards raises. Harmless when repeated.
+
+        A program that JAX keeps holds this renderer, so what is large must go here, not with the last reference.
+        """
         if self._thread is not None:
             self._thread.close()
+        self._canvas = None
 
     def _callback(self, draw: Callable, shape: tuple[int, ...], scene: Scene, camera: CameraPose) -> Array:
         self._open()
@@ -131,7 +135,7 @@ class GlRenderer:
                 fill(canvas, frames[index])
 
         if self._thread is None or self._canvas is None:
-            raise RuntimeError("this OpenGL renderer is not open")
+            raise RuntimeError("this OpenGL renderer is closed")
         self._thread.call(draw_all, self._canvas)
         return frames
 

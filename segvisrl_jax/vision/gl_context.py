@@ -19,6 +19,7 @@ from typing import Any, ParamSpec, TypeVar
 import mujoco
 
 from segvisrl_jax.config import ConfigError, one_line
+from segvisrl_jax.cpu import give_back_freed_memory
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -177,6 +178,8 @@ class GlThread:
             task()
             del task  # it may hold the last reference to what must be freed here
         self._cleanup()
+        self._cleanup = lambda: None  # what it cleaned up is large, and whoever has this object may keep it
+        give_back_freed_memory()
 
 
 def open_draw_context(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:

@@ -99,9 +99,10 @@ def draw(frames: int) -> Soaked:
     memory, rounds = [], -(-frames // FRAMES_A_RENDERER)
     for i in counted(rounds, "gl"):
         env = RoverEnv(config)
-        state = env.initial_state(jax.random.key(i))
+        state = jax.jit(env.initial_state)(jax.random.key(i))
+        look = jax.jit(env.observe)  # as users do; outside of jit, JAX keeps a program of every new callback
         for _ in range(FRAMES_A_RENDERER):
-            np.asarray(env.observe(state))
+            np.asarray(look(state))
             memory.append(resident_mib())
         with contextlib.suppress(AttributeError):
             env.renderer.close()  # type: ignore[union-attr]

@@ -1,8 +1,10 @@
 """The OpenGL renderer draws what MuJoCo's does, in compiled programs too, and fails clearly."""
 
+import gc
 import os
 import subprocess
 import sys
+import weakref
 
 import cv2
 import jax
@@ -260,6 +262,18 @@ def test_after_close_drawing_says_so():
     renderer.close()
     with pytest.raises(Exception, match="closed"):
         jax.block_until_ready(draw(layout((6, 0)), looking_along_x(0)))
+
+
+@pytest.mark.gl
+def test_closing_frees_the_model_although_a_program_still_holds_the_renderer():
+    renderer = GlRenderer(CONFIG, np.arange(4), np.arange(4))
+    draw = jax.jit(renderer.classes)
+    draw(layout((6, 0)), looking_along_x(0)).block_until_ready()
+    canvas = weakref.ref(renderer._canvas)
+    renderer.close()
+    gc.collect()
+    assert canvas() is None
+    assert draw  # and with it the program
 
 
 @pytest.mark.parametrize("rows", [[-1], [HEIGHT], [], [[0]], [0.5]])
