@@ -1,7 +1,7 @@
 # %% [markdown]
 # # What do they do in the same scene?
 # All methods drive the same test scenes. Among the first of them, the paper's kinds of scenes are looked for: the P
-# controller crashes where all others arrive; a policy dodges a rock and runs late; a policy fails where another method
+# controller crashes where all others arrive; a policy makes a detour, late or not; a policy fails where another method
 # arrives; all arrive. Each is the first such scene (of detours the longest), drawn as a map: rocks with the circle that
 # counts as a collision, the goal with the circle that counts as arrival, a line for each method with how it ended.
 #

@@ -29,7 +29,15 @@ import tyro
 
 from segvisrl_jax.cli import parse
 from segvisrl_jax.commands.eval import load_driver, machine_record
-from segvisrl_jax.config import IMAGE_OBSERVATIONS, ConfigError, EnvConfig, replace_fields, require
+from segvisrl_jax.config import (
+    IMAGE_OBSERVATIONS,
+    ConfigError,
+    EnvConfig,
+    flatten,
+    replace_fields,
+    require,
+    to_dict,
+)
 from segvisrl_jax.config.conditions import AFFECTS
 from segvisrl_jax.env.rover_env import RoverEnv
 from segvisrl_jax.env.wrappers import TEST_STREAM, scene_stream
@@ -178,10 +186,16 @@ def drivers_of(words: Sequence[str]) -> list[Driver]:
     drivers = []
     for word in words:
         policy, params, config = load_driver(**driver_options(word))
-        leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(params)]
-        digest = hashlib.sha256(b"".join([*leaves, repr(config).encode()])).hexdigest()[:16]
-        drivers.append(Driver(driver_name(word), policy, params, config, digest))
+        drivers.append(Driver(driver_name(word), policy, params, config, digest_of(params, config)))
     return drivers
+
+
+def digest_of(params: Any, config: EnvConfig) -> str:
+    """Of parameters, and of settings that are not the default: a setting that is new changes nothing."""
+    default = flatten(to_dict(EnvConfig()))
+    changed = {name: value for name, value in flatten(to_dict(config)).items() if value != default[name]}
+    leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(params)]
+    return hashlib.sha256(b"".join([*leaves, json.dumps(changed, sort_keys=True).encode()])).hexdigest()[:16]
 
 
 def severities(kind: Kind, config: EnvConfig, most: int | None) -> list[float]:

@@ -91,7 +91,7 @@ def find_cases(methods: Sequence[Driven]) -> dict[str, int | None]:
     fails = (crashes | (outcome == Outcome.FALL)) & is_policy
     worth = {
         "the P controller crashes, all others arrive": (crashes & is_baseline).any(0) & (arrives | is_baseline).all(0),
-        "a policy dodges and runs late": np.where(is_policy, _dodged_m(methods, arrives), 0.0).max(axis=0),
+        "the longest detour of a policy": np.where(is_policy, _dodged_m(methods, arrives), 0.0).max(axis=0),
         "a policy fails where another method arrives": fails.any(0) & arrives.any(0),
         "all arrive": arrives.all(0),
     }
