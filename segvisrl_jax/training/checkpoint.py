@@ -32,6 +32,7 @@ from segvisrl_jax.training.manifest import (
 from segvisrl_jax.training.processes import Processes
 
 CHECKPOINTS_KEPT = 2
+POLICY_TRIES = 5  # to read a policy that is being replaced by a better one
 POLICY_FORMAT = FIRST_WITH_CHECKSUMS = 2  # before: the parameters in params.npz
 SETTINGS_FILE = "config.json"  # of the run
 DAMAGED_FOLDER = "damaged"  # where checkpoints go that cannot be read
@@ -44,7 +45,8 @@ class Checkpoints:
     Opening looks at what is there: what was not finished is removed, what is damaged is set aside, and ``say`` is told.
 
     Raises:
-        ConfigError: where checkpoints are there and none is whole, or all belong to other settings than the run's.
+        ConfigError: where checkpoints are there and none is whole, one is of a newer version, or all belong to other
+            settings than the run's. They stay where they are.
     """
 
     def __init__(self, run_dir: Path, processes: Processes | None = None, say: Callable[[str], None] = print):
@@ -137,21 +139,34 @@ class Checkpoints:
             raise ConfigError(
                 f"{self._run_dir / SETTINGS_FILE}: is not what its checkpoints were made with: changed, or damaged"
             )
-        refused = []
+        if complaints and None not in complaints.values():  # nothing is moved: it may be needed, or mended
+            told = "; ".join(f"update {path.name}: {complaint}" for path, complaint in complaints.items())
+            raise ConfigError(f"no whole checkpoint is left: {told}")
         for path, complaint in complaints.items():
             if complaint is None:
+                self._tell_versions(path)
                 break
-            refused.append(complaint)
             self._remove(path, complaint)
-        if refused and len(refused) == len(found) and any(complaint != UNFINISHED for complaint in refused):
-            raise ConfigError(f"no whole checkpoint is left: {'; '.join(refused)}")
+
+    def _tell_versions(self, path: Path) -> None:
+        """Says what has changed since a checkpoint was made, which may change what comes of it."""
+        then, now = read_manifest(path).get("versions") or {}, library_versions()
+        changed = [f"{name} {then[name]}, now {now.get(name)}" for name in then if then[name] != now.get(name)]
+        if changed:
+            self._say(f"the checkpoint of update {path.name} was made with {'; '.join(changed)}: results may differ")
 
     def _complaint(self, path: Path) -> str | None:
-        """What keeps a checkpoint from being used."""
+        """What keeps a checkpoint from being used.
+
+        Raises:
+            ConfigError: where a newer version wrote it.
+        """
         if not (path / MANIFEST).exists():
             return UNFINISHED
         try:
             about = read_manifest(path)
+        except ConfigError:
+            raise
         except ValueError as error:
             return str(error)
         return None if about.get("settings") == self._settings() else FOREIGN
@@ -164,7 +179,7 @@ class Checkpoints:
         aside = self._run_dir / DAMAGED_FOLDER / path.name
         shutil.rmtree(aside, ignore_errors=True)
         aside.parent.mkdir(exist_ok=True)
-        path.rename(aside)
+        shutil.move(path, aside)  # to another file system, where checkpoints/ is a link there
         self._say(f"warning: the checkpoint of update {path.name} is not used ({complaint}); it is in {aside} now")
 
 
@@ -243,7 +258,29 @@ def load_policy(folder: Path) -> tuple[TrainConfig, Any, dict[str, Any]]:
         ConfigError: where it is missing or damaged; the message names the file.
     """
     folder = _find_policy(Path(folder))
-    config, scores, params_file = _read_card(folder / "policy.json")
+    card = folder / "policy.json"
+    for tries_left in reversed(range(POLICY_TRIES)):
+        before = _stamp(card)
+        try:
+            return _read_policy(card)
+        except ConfigError:
+            if not tries_left or _stamp(card) == before:  # else a training has just put a better one there
+                raise
+    raise AssertionError("the last try returns or raises")
+
+
+def _stamp(file: Path) -> tuple[int, int] | None:
+    """Another one whenever a file has been replaced."""
+    try:
+        stat = file.stat()
+    except OSError:
+        return None
+    return stat.st_ino, stat.st_mtime_ns
+
+
+def _read_policy(card: Path) -> tuple[TrainConfig, Any, dict[str, Any]]:
+    """See ``load_policy``."""
+    config, scores, params_file = _read_card(card)
     try:
         with np.load(params_file, allow_pickle=False) as arrays:
             params = _nest({name: arrays[name] for name in arrays.files})
@@ -261,7 +298,7 @@ def _read_card(path: Path) -> tuple[TrainConfig, dict[str, Any], Path]:
             config, scores = from_dict(TrainConfig, card["config"]), card["scores"]
             params = card["params"] if version >= FIRST_WITH_CHECKSUMS else {"file": "params.npz"}
             params_file = path.parent / Path(params["file"]).name
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise ConfigError(f"{path}: not a policy's card ({error})") from None
     if version > POLICY_FORMAT:
         raise ConfigError(f"{path}: was written by a newer version of segvisrl_jax (format {version})")

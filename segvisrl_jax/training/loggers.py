@@ -4,7 +4,9 @@
 are in ``trackers``, the display on the screen in ``metrics``.
 """
 
+import contextlib
 import json
+import os
 import time
 from collections.abc import Callable, Mapping
 from io import FileIO
@@ -92,9 +94,10 @@ class JsonLines:
         self._file.close()
 
     def _require_there(self) -> None:
-        """Puts the file back where it was, with what was in it, if somebody removed it."""
-        if self._path.exists():
-            return
+        """Puts the file back where it was, with what was in it, if somebody removed it or put another in its place."""
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(self._path.stat(), os.fstat(self._file.fileno())):
+                return
         self._file.seek(0)
         kept = self._file.read(self._size)
         self._path.parent.mkdir(parents=True, exist_ok=True)

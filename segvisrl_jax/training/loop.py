@@ -25,7 +25,7 @@ from segvisrl_jax.training.checkpoint import load_policy
 from segvisrl_jax.training.cores import Cores, acting_cores
 from segvisrl_jax.training.devices import ACTOR, BY_ENV, BY_TIME_AND_ENV, EVERYWHERE, TRAJECTORY, Devices
 from segvisrl_jax.training.evaluation import Evaluator, summarize
-from segvisrl_jax.training.metrics import ProgressDisplay
+from segvisrl_jax.training.metrics import ProgressDisplay, output_may_fail
 from segvisrl_jax.training.policy import Policy, network_policy
 from segvisrl_jax.training.processes import Processes, join
 from segvisrl_jax.training.rollout import ActorState, EpisodeLog, start_acting, unroll
@@ -182,6 +182,7 @@ def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | N
             is of another architecture, or sees something else; where a logger is not installed or cannot be opened.
         DivergedError: where a loss or gradient was not finite in each of ``max_bad_updates`` updates in a row.
     """
+    say = functools.partial(_tell, say)
     processes = join(config)
     processes.together(lambda: require_installed(config.loggers))
     first_params = None if config.resume else processes.together(lambda: _params_to_start_from(config))
@@ -206,6 +207,12 @@ def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | N
     processes.leave()
     decisions = (runs[0].num_saved or 0) * config.ppo.decisions_per_update
     return TrainResult(tuple(run.folder for run in runs), finished, missing, decisions)
+
+
+def _tell(say: Callable[[str], object], line: str) -> None:
+    """Says a line; a training does not end because nobody can hear it."""
+    with output_may_fail():
+        say(line)
 
 
 def _say_nothing(line: str) -> None:
@@ -270,6 +277,8 @@ class _Session:
             return self.trainer.start(first_params)
         begun = [run.num_saved is not None for run in self.runs]
         if not any(begun):
+            for run in self.runs:
+                run.require_nothing_lost()
             self.runs[0].say("nothing was saved yet: starting at the beginning")
             return self.trainer.start(_params_to_start_from(self.config))
         require(all(begun), "num_seeds", len(self.runs), "1, for each run by itself: not all of them have a checkpoint")

@@ -3,6 +3,7 @@
 A folder without a manifest was not finished: the manifest is written last, in one move.
 """
 
+import contextlib
 import hashlib
 import json
 import os
@@ -11,13 +12,20 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import IO, Any
 
+from segvisrl_jax.config import ConfigError, read_json
+
 MANIFEST = "manifest.json"
 FORMAT = 1
 PACKAGES = ("segvisrl_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx", "numpy")
 
 
 def write_manifest(folder: Path, about: dict[str, Any]) -> None:
-    """Writes the checksum of every file of a folder, and JSON data about them, to ``manifest.json`` in it."""
+    """Writes the checksum of every file of a folder, and JSON data about them, to ``manifest.json`` in it.
+
+    The files are on disk before it is, whatever happens to the machine then.
+    """
+    for path in [*folder.rglob("*"), folder]:
+        _keep_on_disk(path)
     listed = {"format": FORMAT, "about": about, "files": {name: sha256_of(folder / name) for name in _names(folder)}}
     text = json.dumps(listed | {"sha256": sha256_of_json(listed)}, indent=2) + "\n"
     replace_file(folder / MANIFEST, lambda file: file.write(text.encode()))
@@ -28,10 +36,11 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
     Raises:
         ValueError: where a file is missing or other than it was; the message names it.
+        ConfigError: where it is of a newer format.
     """
     path = folder / MANIFEST
     try:
-        listed = json.loads(path.read_text())
+        listed = read_json(path)
         whole = listed.pop("sha256") == sha256_of_json(listed)
         newer = listed["format"] > FORMAT
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -39,7 +48,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if not whole:
         raise ValueError(f"{path}: is damaged (its checksum is another)")
     if newer:
-        raise ValueError(f"{path}: was written by a newer version of segvisrl_jax")
+        raise ConfigError(f"{path}: was written by a newer version of segvisrl_jax")
     for name, expected in listed["files"].items():
         require_sha256(folder / name, expected)
     return listed["about"]
@@ -92,9 +101,20 @@ def replace_file(path: Path, write: Callable[[IO[bytes]], object]) -> None:
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
+        _keep_on_disk(path.parent)
     except OSError:
         partial.unlink(missing_ok=True)
         raise
+
+
+def _keep_on_disk(path: Path) -> None:
+    """Has the system write a file, or a folder's list of files, to the disk now, where it can."""
+    with contextlib.suppress(OSError):  # some file systems refuse it for folders
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def _names(folder: Path) -> list[str]:

@@ -10,7 +10,7 @@ import datetime
 import functools
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ __all__ = [
     "STEP_KEY",
     "MetricsWriter",
     "ProgressDisplay",
+    "output_may_fail",
     "read_metrics",
 ]
 
@@ -145,6 +146,15 @@ def _number(value: Any) -> int | float | None:
     return float(number) if math.isfinite(number) else None
 
 
+@contextlib.contextmanager
+def output_may_fail() -> Iterator[None]:
+    """Lets work go on where standard output is full, closed, gone with its terminal, or cannot write a letter."""
+    try:
+        yield
+    except (OSError, ValueError, SystemExit):  # the last is what rich makes of a pipe that nobody reads any more
+        return
+
+
 class ProgressDisplay:
     """How training stands: on a terminal a bar and the last numbers, elsewhere a line at times.
 
@@ -156,7 +166,7 @@ class ProgressDisplay:
         plain_interval_s: least time between two lines where the console is no terminal.
 
     Use it as a context manager; an exception or Ctrl-C passes through it and leaves the terminal in
-    order, with the last numbers on it.
+    order, with the last numbers on it. Work goes on where nothing can be shown (``output_may_fail``).
     """
 
     def __init__(
@@ -189,6 +199,10 @@ class ProgressDisplay:
             number = _number(value)
             if number is not None:
                 self._values[name] = number
+        with output_may_fail():
+            self._show(decisions)
+
+    def _show(self, decisions: int) -> None:
         if self._live is None:
             self._plain.show(f"{self._description} {self._pace.describe()}  {self._numbers()}")
             return
@@ -196,9 +210,11 @@ class ProgressDisplay:
         self._live.update(Group(self._bar, Text(self._numbers(), style="dim")))
 
     def __exit__(self, *exception: object) -> None:
-        self._plain.finish()
+        with output_may_fail():
+            self._plain.finish()
         if self._live is not None:
-            self._live.stop()
+            with output_may_fail():
+                self._live.stop()
             self._live = None
 
     def _numbers(self) -> str:

@@ -15,9 +15,10 @@ import numpy as np
 
 from segvisrl_jax.agent.networks import Params
 from segvisrl_jax.config import BOOKKEEPING, ConfigError, TrainConfig, flatten, one_line, read_json, to_dict
-from segvisrl_jax.training.checkpoint import Checkpoints, save_policy
+from segvisrl_jax.training.checkpoint import Checkpoints, load_policy, save_policy
 from segvisrl_jax.training.manifest import replace_file
 from segvisrl_jax.training.metrics import MetricsWriter
+from segvisrl_jax.training.metrics_rows import read_rows
 from segvisrl_jax.training.processes import Processes
 from segvisrl_jax.training.rollout import EpisodeLog
 from segvisrl_jax.training.run_lock import RunLock, is_being_trained
@@ -60,7 +61,10 @@ class Run:
         self.num_saved: int | None = None  # updates behind the newest checkpoint
         self._recent: collections.deque[list[float]] = collections.deque(maxlen=RECENT_EPISODES)
         self._is_first, self._is_alone = processes.is_first, processes.count == 1
-        self._policy_waiting: Callable[[], None] | None = None
+        self._lock: RunLock | None = None
+        self._policy: tuple[Params, dict[str, Any]] | None = None  # the best, with its scores
+        self._policy_is_waiting = False
+        self._best_on_disk: list[float] = []  # rank of the policy there
         self._failing: set[str] = set()
         with contextlib.ExitStack() as stack:
             self._writer: MetricsWriter | None = None
@@ -71,7 +75,7 @@ class Run:
             self._open = stack.pop_all()
 
     def _open_writer(self, stack: contextlib.ExitStack) -> None:
-        stack.enter_context(contextlib.closing(RunLock(self.folder)))
+        self._lock = stack.enter_context(contextlib.closing(RunLock(self.folder)))
         trackers = open_trackers(self.config, self.folder)
         self._writer = stack.enter_context(MetricsWriter(self.folder, trackers=trackers, say=self.say))
 
@@ -82,11 +86,41 @@ class Run:
             ConfigError: where there is none, or it does not fit.
         """
         state, data = self._checkpoints.restore_latest(like)
+        unknown = sorted(set(data) - {field.name for field in dataclasses.fields(HostState)})
+        if unknown:
+            raise ConfigError(f"{self.folder}: its checkpoint is of a newer version of segvisrl_jax ({unknown[0]})")
         self.host = HostState(**data)
+        if self._is_first:
+            self._find_policy()
         self._recent.clear()
         self._recent.extend(self.host.recent)
         self.say(f"going on from update {self.host.updates} of {self.config.num_updates}")
         return state
+
+    def require_nothing_lost(self) -> None:
+        """Where there is no checkpoint: checks that there never was one.
+
+        Raises:
+            ConfigError: where the run has numbers of updates that lie behind a checkpoint.
+        """
+        reached = max((int(row["step"]) for row in read_rows(self.folder)), default=0)
+        updates = reached // self.config.ppo.decisions_per_update
+        if updates > self.config.checkpoint_every_updates:
+            raise ConfigError(
+                f"run = {str(self.folder)!r}: has numbers of {updates} updates and no checkpoint any more; "
+                "put its checkpoints/ back, or start again under another --run"
+            )
+
+    def _find_policy(self) -> None:
+        """Reads the best policy, to put it back if it vanishes; a later one takes its place where it is not there."""
+        if not self.host.best:
+            return
+        try:
+            _, params, scores = load_policy(self.folder / "policy")
+            self._policy, self._best_on_disk = (params, scores), _rank(scores)
+        except (ConfigError, KeyError, TypeError) as error:
+            self.say(f"warning: the best policy so far is not there ({one_line(error)}); the next one is kept")
+        self.host.best = min(self.host.best, self._best_on_disk)
 
     def begin(self) -> None:
         """Drops the numbers of updates that are going to be made again."""
@@ -107,13 +141,12 @@ class Run:
 
     def judge(self, summary: dict[str, Any], params: Params) -> dict[str, float]:
         """Keeps a policy that is as good as the best so far, and gives the row of its evaluation."""
-        rank = [summary["success"], -summary["collision"], summary["spl"]]
+        rank = _rank(summary)
         if rank >= (self.host.best or rank):
             self.host.best = rank
-            scores = {**summary, "scenes": "validation", "decisions": self.decisions}
             if self._is_first:
-                folder = self.folder / "policy"
-                self._policy_waiting = functools.partial(save_policy, folder, self.config, params, scores)
+                scores = {**summary, "scenes": "validation", "decisions": self.decisions}
+                self._policy, self._policy_is_waiting = (jax.device_get(params), scores), True
                 self._write_policy()
         low, high = summary["success_ci95"]
         kept = {k: v for k, v in summary.items() if isinstance(v, float)}
@@ -126,37 +159,56 @@ class Run:
 
     def write(self, row: dict[str, float]) -> None:
         """Writes a row to every logger."""
+        self._require_ours()
         if self._writer:
             self._writer.write(self.decisions, row)
 
     def save(self, state: Any, host: HostState | None = None) -> None:
         """Writes a checkpoint: of now, or of when the host's state was ``host``."""
-        self._put_settings_back()
+        self._require_ours()
+        self._put_back()
+        self._write_policy()
         host = host or self.host
-        write = functools.partial(self._checkpoints.save, host.updates, state, dataclasses.asdict(host))
+        data = dataclasses.asdict(host)
+        if self._policy_is_waiting:  # who goes on from here must not wait for a better one than it
+            data["best"] = self._best_on_disk
+        write = functools.partial(self._checkpoints.save, host.updates, state, data)
         if not self._is_alone:
             write()  # the others wait for this process: what fails here fails everywhere
             self.num_saved = self._checkpoints.latest
         elif self._try(f"the checkpoint of update {host.updates}", write):
             self.num_saved = self._checkpoints.latest
-        self._write_policy()
 
     def not_on_disk(self, updates: int | None) -> list[str]:
         """What could not be written in spite of all tries, after one more; ``updates``: of the expected checkpoint."""
         missing = [] if self.num_saved == updates else [f"the checkpoint of update {updates}"]
         self._write_policy()
-        missing += ["the best policy"] if self._policy_waiting else []
+        missing += ["the best policy"] if self._policy_is_waiting else []
         lines = self._writer.catch_up() if self._writer else 0
         return missing + ([f"{lines} lines of metrics.jsonl"] if lines else [])
 
     def _write_policy(self) -> None:
-        if self._policy_waiting and self._try("the best policy", self._policy_waiting):
-            self._policy_waiting = None
+        if self._policy is None or not self._policy_is_waiting:
+            return
+        params, scores = self._policy
+        write = functools.partial(save_policy, self.folder / "policy", self.config, params, scores)
+        if self._try("the best policy", write):
+            self._policy_is_waiting, self._best_on_disk = False, _rank(scores)
 
-    def _put_settings_back(self) -> None:
-        """Writes config.json again where somebody removed the run's folder."""
-        if self._is_first and not (self.folder / "config.json").exists():
+    def _require_ours(self) -> None:
+        """Nothing is written into another run's folder; where it cannot be looked at, writing says why."""
+        if self._lock is not None:
+            with contextlib.suppress(OSError):
+                self._lock.require_ours()
+
+    def _put_back(self) -> None:
+        """Writes the settings and the best policy again where somebody removed the run's folder."""
+        if not self._is_first:
+            return
+        if not _is_there(self.folder / "config.json"):
             self._try("config.json", functools.partial(_write_settings, self.folder, self.config))
+        if self._policy is not None and not _is_there(self.folder / "policy" / "policy.json"):
+            self._policy_is_waiting = True
 
     def _try(self, what: str, write: Callable[[], None]) -> bool:
         try:
@@ -280,6 +332,19 @@ def _require_same_run(config: TrainConfig, then: dict[str, Any], run_dir: Path) 
     for name, value in now.items():
         if name not in FREE_ON_RESUME and value != then.get(name):
             raise ConfigError(f"{name} = {value!r}: should be {then.get(name)!r}, as when {run_dir} was started")
+
+
+def _rank(scores: dict[str, Any]) -> list[float]:
+    """What the best policy has most of: successes, then few collisions, then short paths."""
+    return [scores["success"], -scores["collision"], scores["spl"]]
+
+
+def _is_there(path: Path) -> bool:
+    """Whether a file is there; it is not where the file system does not say."""
+    try:
+        return path.exists()
+    except OSError:
+        return False
 
 
 def _finished_episodes(log: EpisodeLog) -> list[list[float]]:

@@ -1,6 +1,7 @@
 """One process at a time writes to a run's folder. The kernel ends the lock with its process, however that ends."""
 
 import contextlib
+import os
 import time
 from pathlib import Path
 from typing import IO
@@ -19,19 +20,51 @@ class RunLock:
     """
 
     def __init__(self, run_dir: Path) -> None:
-        self._file: IO[bytes] = (Path(run_dir) / LOCK_FILE).open("wb")
-        for tries_left in reversed(range(TRIES)):
-            try:
-                return _lock(self._file, exclusive=True)
-            except BlockingIOError:
-                if tries_left:
-                    time.sleep(TRY_EVERY_S)
-        self._file.close()
-        raise ConfigError(f"run = {str(run_dir)!r}: another process is training it")
+        self._run_dir = Path(run_dir)
+        self._file = _locked_file(self._run_dir)
+
+    def require_ours(self) -> None:
+        """Checks that the folder is still the one that was locked; takes it anew where somebody removed it.
+
+        Raises:
+            ConfigError: where it was removed, and another run stands in its place.
+            OSError: where it cannot be made again, or looked at.
+        """
+        path = self._run_dir / LOCK_FILE
+        try:
+            if os.path.samestat(path.stat(), os.fstat(self._file.fileno())):
+                return
+        except FileNotFoundError:
+            self._run_dir.mkdir(parents=True, exist_ok=True)
+            file, self._file = self._file, _locked_file(self._run_dir)
+            file.close()
+            return
+        raise ConfigError(
+            f"run = {str(self._run_dir)!r}: was removed while it trained, and another run stands there now; "
+            "nothing more is written"
+        )
 
     def close(self) -> None:
         """Lets go of the folder; a second call does nothing."""
         self._file.close()
+
+
+def _locked_file(run_dir: Path) -> IO[bytes]:
+    """An open file that holds the lock.
+
+    Raises:
+        ConfigError: where another process holds it.
+    """
+    file = (run_dir / LOCK_FILE).open("wb")
+    for tries_left in reversed(range(TRIES)):
+        try:
+            _lock(file, exclusive=True)
+            return file
+        except BlockingIOError:
+            if tries_left:
+                time.sleep(TRY_EVERY_S)
+    file.close()
+    raise ConfigError(f"run = {str(run_dir)!r}: another process is training it")
 
 
 def is_being_trained(run_dir: Path) -> bool:

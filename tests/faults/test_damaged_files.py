@@ -18,6 +18,7 @@ from segvisrl_jax.assets import asset_dir
 from segvisrl_jax.config import ConfigError, preset_config, replace_fields
 from segvisrl_jax.training import loop
 from segvisrl_jax.training.checkpoint import DAMAGED_FOLDER, Checkpoints, load_policy
+from segvisrl_jax.training.manifest import sha256_of_json
 from segvisrl_jax.training.metrics import read_metrics
 
 SMALL = {"num_envs": 4, "unroll_length": 8, "num_minibatches": 2, "max_decisions": 10, "mlp_sizes": (8, 8)}
@@ -104,9 +105,62 @@ def test_where_none_is_whole_the_files_are_named(runs, empty_state, tmp_path):
         for step in ("2", "3"):
             name = next(name for name, at in cases(run / "checkpoints" / step, other / step) if at == kind)
             damage(run / "checkpoints" / step, other / step, name, kind)
-        with pytest.raises(ConfigError, match=rf"no whole checkpoint is left: .*/3/.*{name}.*; .*/2/.*{name}"):
-            restored(run, empty_state)
+        for _ in range(2):  # what is refused once is refused again: nothing has been moved
+            with pytest.raises(ConfigError, match=rf"no whole checkpoint is left: .*/3/.*{name}.*; .*/2/.*{name}"):
+                restored(run, empty_state)
+        assert sorted(path.name for path in (run / "checkpoints").iterdir()) == ["2", "3"]
         shutil.rmtree(run)
+
+
+@pytest.mark.slow
+def test_a_run_whose_checkpoints_are_lost_does_not_begin_again(runs, tmp_path, capsys):
+    shutil.copytree(runs / "run", tmp_path / "run")
+    shutil.rmtree(tmp_path / "run" / "checkpoints")
+    before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    for _ in range(2):
+        assert cli.main(["train", "--resume", "--runs-dir", str(tmp_path), "--run", "run"]) == 2
+        assert "has numbers of 3 updates and no checkpoint" in capsys.readouterr().err
+    assert all(path.read_bytes() == content for path, content in before.items())
+
+
+@pytest.mark.slow
+def test_a_checkpoint_without_manifest_is_kept_where_no_other_is_whole(runs, empty_state, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(runs / "run", run)
+    (run / "checkpoints" / "2" / "manifest.json").unlink()
+    (run / "checkpoints" / "3" / "manifest.json").write_bytes(b"")
+    with pytest.raises(ConfigError, match="no whole checkpoint is left"):
+        restored(run, empty_state)
+    assert (run / "checkpoints" / "2" / "state").is_dir()
+
+
+@pytest.mark.slow
+def test_a_checkpoint_of_a_newer_version_is_refused_and_left_alone(runs, empty_state, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(runs / "run", run)
+    rewritten(run / "checkpoints" / "3" / "manifest.json", format=99)
+    with pytest.raises(ConfigError, match=r"/3/manifest.json: was written by a newer version"):
+        restored(run, empty_state)
+    assert sorted(path.name for path in (run / "checkpoints").iterdir()) == ["2", "3"]
+
+
+@pytest.mark.slow
+def test_other_versions_of_libraries_are_named(runs, empty_state, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(runs / "run", run)
+    manifest = run / "checkpoints" / "3" / "manifest.json"
+    about = json.loads(manifest.read_text())["about"]
+    rewritten(manifest, about=about | {"versions": about["versions"] | {"jax": "0.4.1"}})
+    updates, _, said = restored(run, empty_state)
+    assert updates == 3
+    assert "the checkpoint of update 3 was made with jax 0.4.1, now " in said[0]
+
+
+def rewritten(manifest: Path, **changes):
+    """A manifest with other contents, and the checksum that belongs to them."""
+    listed = json.loads(manifest.read_text()) | changes
+    del listed["sha256"]
+    manifest.write_text(json.dumps(listed | {"sha256": sha256_of_json(listed)}))
 
 
 @pytest.mark.slow

@@ -1,10 +1,13 @@
 """A full disk, folders that cannot be written or vanish: said aloud, and the last checkpoint stays good."""
 
+import contextlib
+import io
 import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from unittest import mock
 
 import jax
 import numpy as np
@@ -12,7 +15,7 @@ import pytest
 
 from segvisrl_jax import cli
 from segvisrl_jax.config import ConfigError, preset_config, replace_fields
-from segvisrl_jax.training import loop
+from segvisrl_jax.training import loop, run
 from segvisrl_jax.training.checkpoint import Checkpoints, load_policy
 from segvisrl_jax.training.metrics import read_metrics
 
@@ -149,6 +152,86 @@ def newest_checkpoint(disk):
 def test_a_folder_that_vanishes_is_made_again(tmp_path, during, undisturbed):
     during[4] = lambda: shutil.rmtree(tmp_path / "run")
     result = loop.train(settings(tmp_path), say=lambda line: None)
+    assert (result.finished, result.not_on_disk) == (True, ())
+    require_same_run(settings(tmp_path), undisturbed)
+
+
+@pytest.fixture
+def ever_worse(monkeypatch):
+    """Evaluations each of which is worse than the one before."""
+    evaluate, shares = loop.Trainer.evaluate, iter(np.linspace(0.9, 0.1, 9))
+
+    def worse(trainer, params, seed):
+        return evaluate(trainer, params, seed) | {"success": float(next(shares))}
+
+    monkeypatch.setattr(loop.Trainer, "evaluate", worse)
+
+
+@pytest.mark.slow
+def test_the_best_policy_is_put_back_where_its_folder_vanished(tmp_path, during, ever_worse):
+    kept = {}
+
+    def vanish():
+        kept["policy"] = load_policy(tmp_path / "run" / "policy")
+        shutil.rmtree(tmp_path / "run")
+
+    during[4] = vanish
+    result = loop.train(settings(tmp_path), say=lambda line: None)
+    assert (result.finished, result.not_on_disk) == (True, ())
+    _, found, scores = load_policy(tmp_path / "run" / "policy")
+    assert scores["success"] == 0.9
+    jax.tree.map(np.testing.assert_array_equal, found, kept["policy"][1])
+
+
+@pytest.mark.slow
+def test_a_best_policy_that_is_lost_makes_room_for_the_next(tmp_path, ever_worse):
+    loop.train(settings(tmp_path), say=lambda line: None)
+    shutil.rmtree(tmp_path / "run" / "policy")
+    said = []
+    loop.train(settings(tmp_path, resume=True, steps=2 * NUM_UPDATES * 32), say=said.append)
+    assert any("the best policy so far is not there" in line for line in said)
+    assert load_policy(tmp_path / "run" / "policy")[2]["success"] == 0.5  # the fifth evaluation's
+
+
+@pytest.mark.slow
+def test_a_policy_that_could_not_be_written_is_not_waited_for(tmp_path, ever_worse):
+    """The first and best of all policies cannot be written, and the run ends; what comes later is kept."""
+    with mock.patch.object(run, "save_policy", refuse):
+        result = loop.train(settings(tmp_path, steps=96), say=lambda line: None)
+    assert result.not_on_disk == (f"{tmp_path}/run: the best policy",)
+    result = loop.train(settings(tmp_path, resume=True, steps=160), say=lambda line: None)
+    assert result.not_on_disk == ()
+    load_policy(tmp_path / "run" / "policy")
+
+
+def refuse(*args, **kwargs):
+    raise PermissionError(13, "Permission denied")
+
+
+@pytest.mark.slow
+def test_permission_that_is_lost_for_a_while_costs_nothing(tmp_path, during, undisturbed):
+    stat = Path.stat
+
+    def locked(path, **how):
+        return refuse() if tmp_path in path.parents else stat(path, **how)
+
+    lock = mock.patch.object(Path, "stat", locked)
+    during[3], during[6] = lock.start, lock.stop
+    result = loop.train(settings(tmp_path), say=lambda line: None)
+    assert (result.finished, result.not_on_disk) == (True, ())
+    require_same_run(settings(tmp_path), undisturbed)
+
+
+@pytest.mark.slow
+def test_output_that_fails_ends_no_training(tmp_path, undisturbed):
+    def say(line):
+        raise OSError(28, "No space left on device")
+
+    full = io.TextIOWrapper(Path("/dev/full").open("wb", buffering=0), line_buffering=True)  # noqa: SIM115
+    with contextlib.redirect_stdout(full):
+        result = loop.train(settings(tmp_path), say=say)
+    with contextlib.suppress(OSError):
+        full.close()
     assert (result.finished, result.not_on_disk) == (True, ())
     require_same_run(settings(tmp_path), undisturbed)
 

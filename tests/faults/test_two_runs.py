@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -47,6 +48,42 @@ def test_who_only_looks_is_waited_for(tmp_path):
         done.start()
         RunLock(tmp_path).close()
         done.join()
+
+
+def test_a_folder_that_was_removed_is_taken_again_and_another_runs_is_not(tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    lock = RunLock(folder)
+    lock.require_ours()
+    shutil.rmtree(folder)
+    lock.require_ours()
+    assert is_being_trained(folder)
+    shutil.rmtree(folder)
+    folder.mkdir()
+    RunLock(folder).close()
+    with pytest.raises(ConfigError, match="another run stands there now"):
+        lock.require_ours()
+    lock.close()
+
+
+@pytest.mark.slow
+def test_a_run_writes_nothing_into_the_folder_of_another(tmp_path, monkeypatch):
+    small = {"num_envs": 4, "unroll_length": 8, "num_minibatches": 2, "mlp_sizes": (8, 8), "steps": 256}
+    config = replace_fields(preset_config("mlp", "smoke"), runs_dir=str(tmp_path), run="run", **small)
+    update, files = loop._Session._update, []
+
+    def replaced_at_the_third(session, state):
+        if session._updates == 2 and not files:
+            shutil.rmtree(tmp_path / "run")
+            (tmp_path / "run").mkdir()
+            RunLock(tmp_path / "run").close()
+            files.extend((tmp_path / "run").rglob("*"))
+        return update(session, state)
+
+    monkeypatch.setattr(loop._Session, "_update", replaced_at_the_third)
+    with pytest.raises(ConfigError, match="another run stands there now"):
+        loop.train(config, say=lambda line: None)
+    assert list((tmp_path / "run").rglob("*")) == files
 
 
 def test_a_folder_without_a_run_is_not_being_trained(tmp_path):

@@ -1,6 +1,7 @@
 """Checkpoints and policies come back bit by bit; what is damaged is named."""
 
 import json
+import threading
 
 import jax
 import jax.numpy as jnp
@@ -105,6 +106,36 @@ def test_a_newer_policy_takes_the_place_of_an_older_one(tmp_path):
     _, found, _ = load_policy(tmp_path)
     np.testing.assert_array_equal(found["params"]["w"], 2.0)
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_policy_is_read_while_it_is_replaced(tmp_path):
+    """The file that its card named may be gone: then there is a new card."""
+    config, values, written = preset_config("mlp", "cpu"), iter(range(1, 1000)), threading.Event()
+
+    def replace():
+        for value in values:
+            save_policy(tmp_path, config, {"params": {"w": np.full(3, value, np.float32)}}, {"value": value})
+            written.set()
+
+    writer = threading.Thread(target=replace)
+    writer.start()
+    written.wait()
+    try:
+        for _ in range(200):
+            _, found, scores = load_policy(tmp_path)
+            np.testing.assert_array_equal(found["params"]["w"], scores["value"])
+    finally:
+        for _ in values:
+            pass
+        writer.join()
+
+
+def test_a_format_that_is_no_number_is_refused(tmp_path):
+    save_policy(tmp_path, preset_config("mlp", "cpu"), {"params": {"w": np.ones(3, np.float32)}}, {})
+    card = tmp_path / "policy.json"
+    card.write_text(card.read_text().replace('"format": 2', '"format": 1e999'))
+    with pytest.raises(ConfigError, match="not a policy's card"):
+        load_policy(tmp_path)
 
 
 def test_a_policy_of_the_first_format_is_read(tmp_path):

@@ -1,5 +1,6 @@
 """Metrics on disk, in TensorBoard, and on the screen."""
 
+import contextlib
 import errno
 import io
 import json
@@ -105,6 +106,17 @@ def test_a_file_that_vanished_is_whole_again_or_not_there(tmp_path, size_limit):
     assert said[1] == "metrics.jsonl is written again"
 
 
+def test_a_copy_in_its_place_is_written_to(tmp_path):
+    """An editor, or rsync, saves a file as a new one."""
+    path = tmp_path / "metrics.jsonl"
+    with MetricsWriter(tmp_path, tensorboard=False) as writer:
+        writer.write(0, {"a": 0})
+        (tmp_path / "copy").write_bytes(path.read_bytes())
+        (tmp_path / "copy").replace(path)
+        writer.write(1, {"a": 1})
+    assert [row["step"] for row in read_metrics(tmp_path)] == [0, 1]
+
+
 def test_closing_does_not_say_that_what_is_lost_was_written(tmp_path, size_limit):
     said = []
     with MetricsWriter(tmp_path, tensorboard=False, say=said.append) as writer:
@@ -122,6 +134,18 @@ def test_a_line_that_a_crash_cut_off_is_dropped(tmp_path):
     with MetricsWriter(tmp_path, tensorboard=False) as writer:
         writer.write(2, {"a": 5})
     assert read_metrics(tmp_path) == [{"step": 1, "a": 1}, {"step": 2, "a": 5}]
+
+
+@pytest.mark.parametrize("output", ["full", "ascii"])
+def test_work_goes_on_where_nothing_can_be_shown(output):
+    where = open("/dev/full", "wb", buffering=0) if output == "full" else io.BytesIO()  # noqa: SIM115
+    file = io.TextIOWrapper(where, "ascii", line_buffering=True)
+    with pytest.raises((OSError, ValueError)):
+        print("é" if output == "ascii" else "line", file=file)
+    with ProgressDisplay(10, description="é", console=Console(file=file), plain_interval_s=0.0) as display:
+        display.update(5, {})
+    with contextlib.suppress(OSError):  # of a full disk, once more
+        file.close()
 
 
 def plain_console():
