@@ -17,6 +17,9 @@ GPU_BATCH ?= 4096
 GPU_FRAMES ?= 64 512
 NOTEBOOKS ?= quickstart bearings curves downsampling failures learning_curves trajectories
 
+$(foreach name,arch preset seed steps run args episodes policy,$(if $(findstring command line,$(origin $(name))),\
+  $(error $(name)=$($(name)): should be written in capitals)))
+
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 EXTRAS_READY := $(VENV)/.extras-ready

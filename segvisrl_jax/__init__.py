@@ -5,7 +5,7 @@ when they are first used, so that importing the package is quick and touches no 
 ``segvisrl_jax/LunarRover-v0`` with Gymnasium.
 """
 
-import importlib
+import importlib.metadata
 from typing import Any
 
 import gymnasium
@@ -32,6 +32,8 @@ gymnasium.register(
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return importlib.metadata.version("segvisrl_jax")
     if name not in _PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_PUBLIC[name]), name)

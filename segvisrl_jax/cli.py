@@ -54,6 +54,16 @@ COMPLAINTS = {
     r"Missing value for argument '(?P<option>.*)'\. Expected \d+ values?\.": "followed by a value",
 }
 """What tyro says of a value, and what would be right."""
+ELSEWHERE = {
+    "lr": "--ppo.learning-rate",
+    "gamma": "--ppo.discount",
+    "ent-coef": "--ppo.entropy-cost",
+    "n-steps": "--ppo.unroll-length",
+    "n-envs": "--ppo.num-envs",
+    "total-timesteps": "--steps",
+    "num-timesteps": "--steps",
+}
+"""What options are called in Stable-Baselines3, CleanRL and brax."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -126,7 +136,7 @@ def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: O
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise _config_error(stop) or ConfigError(_in_our_words(_one_line(said.getvalue()), words)) from None
+        raise _config_error(stop) or ConfigError(_in_our_words(said.getvalue(), words)) from None
 
 
 def _config_error(error: BaseException | None) -> ConfigError | None:
@@ -165,8 +175,9 @@ def _one_line(message: str) -> str:
     return " ".join(paragraph)
 
 
-def _in_our_words(complaint: str, words: Sequence[str]) -> str:
+def _in_our_words(message: str, words: Sequence[str]) -> str:
     """tyro's complaint as all others are: the option, its value, what would be right; as it is where it is unknown."""
+    complaint = _one_line(message)
     for pattern, should in COMPLAINTS.items():
         found = re.fullmatch(pattern, complaint)
         if found:
@@ -181,7 +192,17 @@ def _in_our_words(complaint: str, words: Sequence[str]) -> str:
     before = words[words.index(first) - 1] if first in words[1:] else ""
     if before.startswith("--") and not first.startswith("-"):
         return f"{before} = {first!r}: should be left out; {before} takes no value"
+    meant = ELSEWHERE.get(first.removeprefix("--ppo.").removeprefix("--")) or _suggested(message)
+    if meant and first.startswith("--"):
+        return f"{unknown[1]}: should be {meant}, if that was meant; --help lists the options"
     return f"{unknown[1]}: should be left out; --help lists the options"
+
+
+def _suggested(message: str) -> str:
+    """The options that tyro finds alike, two at most."""
+    _, _, suggestions = message.partition("Perhaps you meant")
+    alike = re.findall(r"^[│| ]+(--[a-z][\w.-]*)", suggestions, re.MULTILINE)
+    return " or ".join(list(dict.fromkeys(alike))[:2])
 
 
 def _as_typed(value: str, words: Sequence[str]) -> str:

@@ -4,9 +4,12 @@ import os
 import subprocess
 import sys
 import zipfile
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+
+import segvisrl_jax
 
 ROOT = Path(__file__).resolve().parents[1]
 USE = """
@@ -59,3 +62,14 @@ def test_the_lock_pins_everything_with_hashes_and_names_no_host():
     assert "://" not in "\n".join(lines)
     majors = {line.split("==")[0]: line.split("==")[1][0] for line in pinned if line.startswith("mujoco")}
     assert majors["mujoco"] == majors["mujoco-mjx"] == "3"
+
+
+def test_the_version_is_that_of_the_package():
+    assert segvisrl_jax.__version__ == version("segvisrl_jax")
+
+
+@pytest.mark.parametrize(("words", "code"), [(["ARCH=cnn"], 0), (["arch=cnn"], 2), (["steps=1000"], 2)])
+def test_make_refuses_variables_in_small_letters(words, code):
+    done = subprocess.run(["make", "help", *words], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == code
+    assert ("should be written in capitals" in done.stderr) == bool(code)

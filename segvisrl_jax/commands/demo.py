@@ -49,7 +49,7 @@ def run(options: Sequence[str]) -> int:
 
 
 def record(asked: DemoOptions) -> str:
-    """Drives the scene and writes the video. Returns how the episode ended."""
+    """Drives the scene and writes the video. Returns how the episode ended, and when."""
     from segvisrl_jax.commands.eval import load_driver, with_overrides
     from segvisrl_jax.env.rover_env import RoverEnv
     from segvisrl_jax.env.wrappers import TEST_STREAM, scene_stream
@@ -60,10 +60,12 @@ def record(asked: DemoOptions) -> str:
     policy_name = asked.policy if named else DEFAULT_POLICY
     policy, params, config = load_driver(asked.run, policy_name, asked.controller)
     env = RoverEnv(with_overrides(config, asked.num_rocks, None, None))
+    print(f"{policy.name} drives scene {asked.scene}; compiling takes half a minute the first time", flush=True)
     episode = drive_episode(env, policy, params, scene_stream(0, TEST_STREAM), asked.scene)
-    frames = episode_frames(env, episode, title=policy.name)
-    write_video(asked.video, frames, fps=FRAMES_PER_SECOND)
-    return episode.outcome.name.lower()
+    seconds = f"{episode.num_decisions * env.dt:.0f} s"
+    print(f"{episode.outcome.name.lower()} after {seconds}; drawing {episode.num_decisions} frames", flush=True)
+    write_video(asked.video, episode_frames(env, episode, title=policy.name), fps=FRAMES_PER_SECOND)
+    return f"{episode.outcome.name.lower()} after {seconds}"
 
 
 FRAMES_PER_SECOND = 8  # eight decisions, so eight simulated seconds, in each second of video

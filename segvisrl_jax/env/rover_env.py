@@ -11,7 +11,15 @@ import numpy as np
 from brax.envs.base import Env, State
 from jaxtyping import Array, Bool, Int32, PRNGKeyArray, Shaped, UInt8, UInt32
 
-from segvisrl_jax.config import IMAGE_OBSERVATIONS, EngineName, EnvConfig, ObservationKind, RendererName, replace_fields
+from segvisrl_jax.config import (
+    IMAGE_OBSERVATIONS,
+    EngineName,
+    EnvConfig,
+    ObservationKind,
+    RendererName,
+    replace_fields,
+    require,
+)
 from segvisrl_jax.env import model, rocks, task
 from segvisrl_jax.env.conditions import (
     first_memory,
@@ -159,7 +167,12 @@ class RoverEnv(Env):
         """One decision of physics and task, without looking. Unbatched.
 
         A state whose physics diverged keeps its last finite coordinates and gets the outcome ``UNSTABLE``.
+
+        Raises:
+            ConfigError: where the action is not of shape (2,).
         """
+        shape = jnp.shape(action)
+        require(shape == (2,), "action", f"of shape {shape}", "of shape (2,); jax.vmap or BatchEnv drive many at once")
         num_decisions = state.num_decisions + jnp.int32(1)
         judged = self.engine.advance(state.physics, wheel_shares(state, action, self.config.task))
         track = _track(judged)

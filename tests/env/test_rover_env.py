@@ -202,6 +202,14 @@ def test_the_shape_is_known_without_building_the_environment(obs):
     assert seen.dtype == (jnp.uint8 if obs in IMAGE_OBSERVATIONS else jnp.float32)
 
 
+@pytest.mark.parametrize("shape", [(1,), (3,), (1, 2), ()])
+def test_an_action_of_another_shape_is_refused(shape):
+    env = segvisrl_jax.make_env(obs="state")
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    with pytest.raises(ConfigError, match=r"action = .*of shape \(2,\)"):
+        jax.eval_shape(env.step, state, jax.ShapeDtypeStruct(shape, jnp.float32))
+
+
 def test_diverged_physics_never_reaches_the_observation():
     env = make("state")
     rover = jax.jit(env.initial_state)(jax.random.key(7))
