@@ -121,7 +121,7 @@ def _summary(name: str, path: Path, test: Score | None) -> RunSummary:
         preset=_text(config, "preset"),
         seed=_whole(config, "seed", 0),
         decisions=done,
-        decisions_asked=asked,
+        decisions_asked=max(asked, done),  # --steps of a later sitting are not in its settings
         state=_state(path, rows, done, asked, per_update, changed_s),
         held_out=_best(rows),
         test=test,
