@@ -21,6 +21,15 @@ def result_row(trial: Trial, run_dir: Path, status: str, node: str) -> dict[str,
     return {**row, **_scores(run_dir)} if status == DONE else row
 
 
+def why_unfinished(run_dir: Path) -> str:
+    """Why a run is not finished, in one line; "" where it is, with scores that can be read."""
+    try:
+        _scores(run_dir)
+    except ConfigError as error:
+        return str(error)
+    return ""
+
+
 def _scores(run_dir: Path) -> dict[str, float]:
     file = run_dir / "eval.json"
     try:
@@ -39,7 +48,7 @@ def _scores(run_dir: Path) -> dict[str, float]:
         for name, value in scores.items():
             require(is_finite(value), name, value, "a finite number")
     except (OSError, ValueError, KeyError, IndexError, TypeError, ArithmeticError) as error:
-        raise ConfigError(f"{run_dir}: not a finished run ({error}); remove it, and it is trained again") from None
+        raise ConfigError(f"{run_dir}: not a finished run ({error})") from None
     return scores
 
 
