@@ -226,6 +226,18 @@ def test_an_evaluation_that_cannot_be_written_leaves_the_one_before(disk, capsys
     assert {path.name for path in disk.iterdir()} == {"old.json", "filler"}
 
 
+@pytest.mark.slow
+def test_a_log_on_a_full_disk_costs_no_training(tmp_path):
+    words = ["train", "--arch", "mlp", "--preset", "smoke", "--runs-dir", str(tmp_path), "--run", "run", *WORDS]
+    command = [sys.executable, "-m", "segvisrl_jax.cli", *words]
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONUNBUFFERED": ""}
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, env=environment)
+    assert (done.returncode, done.stderr) == (1, "segvisrl train: No space left on device\n")
+    assert newest_checkpoint(tmp_path) == 2
+    assert all((tmp_path / "run" / name).stat().st_size for name in PRODUCTS)
+
+
 TRIAL = Trial("seed0", {"seed": "0"}, ())
 CURVE = Curve("run", "mlp", "recipe", "run", 0, Series(*np.ones((2, 1))), Series(*np.ones((2, 1))))
 WRITERS = {  # of what commands leave: each is given the file's name
