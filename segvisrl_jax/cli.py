@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from segvisrl_jax.config import ConfigError
+from segvisrl_jax.config import ConfigError, NotWrittenError, is_disk_trouble
 from segvisrl_jax.machine.memory import OutOfMemory, keep_freed_memory, one_line_where_memory_ends, what_there_is
 from segvisrl_jax.machine.programs import keep_compiled_programs
 
@@ -100,18 +100,44 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"\nsegvisrl {command}: interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more when it ends
+        _drop_output()
         return READER_GONE
     except OSError as error:
-        if error.errno not in BAD_PATH or error.filename is None:
-            raise
-        _complain(command, f"{os.fsdecode(error.filename)!r}: should be a path that can be used ({error.strerror})")
+        return _end_of(command, error)
+
+
+def _end_of(command: str, error: OSError) -> int:
+    """Says in one line what a disk or a path has against what was asked, and gives the exit code.
+
+    Raises:
+        OSError: as it was, where it is the program that is to blame.
+    """
+    name = "" if error.filename is None else f"{os.fsdecode(error.filename)!r}: "
+    if isinstance(error, NotWrittenError):
+        _complain(command, f"{name}cannot be written ({error.strerror})")
+    elif error.errno in BAD_PATH and name:
+        _complain(command, f"{name}should be a path that can be used ({error.strerror})")
         return USAGE_ERROR
+    elif is_disk_trouble(error):
+        _complain(command, name + (error.strerror or str(error)))
+    else:
+        raise error
+    with contextlib.suppress(OSError):
+        sys.stdout.flush()
+        return FAILURE
+    _drop_output()  # it is standard output that cannot be written
+    return FAILURE
+
+
+def _drop_output() -> None:
+    """Sends nowhere what standard output still holds: Python flushes it once more when it ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _complain(command: str, what: str) -> None:
-    """One line, whatever a name or a value has in it."""
-    print(f"segvisrl {command}: {' '.join(what.splitlines())}", file=sys.stderr)
+    """One line, whatever a name or a value has in it; nothing where nobody can be told, as on a closed terminal."""
+    with contextlib.suppress(OSError):
+        print(f"segvisrl {command}: {' '.join(what.splitlines())}", file=sys.stderr)
 
 
 def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: OptionsT | None = None) -> OptionsT:

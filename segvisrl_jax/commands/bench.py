@@ -82,6 +82,8 @@ class BenchOptions:
 
 def run(options: Sequence[str]) -> int:
     """Parses, measures, prints a table for each part; writes JSON where asked."""
+    from segvisrl_jax.training.output import write_output
+
     asked = parse(BenchOptions, options, "bench")
     measure = {
         "physics": _physics,
@@ -108,7 +110,8 @@ def run(options: Sequence[str]) -> int:
             rows += _conclude_growth(asked, measured)
         if asked.json is not None:  # after each part: a later one may fail
             command = shlex.join(["segvisrl", "bench", *options])
-            asked.json.write_text(json.dumps({"command": command, "machine": before, "rows": rows}, indent=2) + "\n")
+            content = {"command": command, "machine": before, "rows": rows}
+            write_output(asked.json, json.dumps(content, indent=2) + "\n")
     return 0
 
 

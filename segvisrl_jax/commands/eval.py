@@ -54,13 +54,15 @@ class EvalOptions:
 
 def run(options: Sequence[str]) -> int:
     """Parses, drives, prints; writes JSON where asked."""
+    from segvisrl_jax.training.output import write_output
+
     asked = parse(EvalOptions, options, "eval")
     if asked.json is not None:
         require_file_can_be_written(asked.json, "--json")
     result = evaluate(asked)
     print(f"{result['method']}: {report_line(result)}")
     if asked.json is not None:
-        asked.json.write_text(as_json(result))
+        write_output(asked.json, as_json(result))
     return 0
 
 

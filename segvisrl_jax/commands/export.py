@@ -80,6 +80,7 @@ def export(asked: ExportOptions) -> tuple[bool, dict[str, Any]]:
     from segvisrl_jax.export.metadata import describe
     from segvisrl_jax.export.step import PolicyStep
     from segvisrl_jax.training.checkpoint import load_policy
+    from segvisrl_jax.training.output import write_output
 
     policy, params, world = load_driver(asked.run, asked.policy, None)
     env = RoverEnv(with_overrides(world, None, "auto", "auto"))
@@ -93,12 +94,5 @@ def export(asked: ExportOptions) -> tuple[bool, dict[str, Any]]:
     check = {**compare(file_step, step.on_host(), drives, step.start_carry()), "runtime": kind.runtime}
     agrees = check["largest_action_difference"] <= check["allowed_difference"]
     if agrees:
-        _write(asked.path, kind.with_metadata(built, {**described, "check": check}))
+        write_output(asked.path, kind.with_metadata(built, {**described, "check": check}))
     return agrees, check
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Writes beside the file, then moves over it, so that no half-written file is ever read."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(content)
-    partial.replace(path)

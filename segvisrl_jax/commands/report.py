@@ -62,9 +62,10 @@ def run(options: Sequence[str]) -> int:
     asked = parse(ReportOptions, options, "report")
 
     from segvisrl_jax.report.page import render
+    from segvisrl_jax.training.output import write_output
 
     page = make_page(asked, shlex.join(["segvisrl", "report", *options]))
-    asked.output.write_text(render(page), encoding="utf-8")
+    write_output(asked.output, render(page))
     print(f"{asked.output} ({asked.output.stat().st_size / 1e6:.1f} MB)")
     return 0
 

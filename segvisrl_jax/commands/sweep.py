@@ -1,5 +1,6 @@
 """``segvisrl sweep``: one training for each combination of settings; a table and a plot."""
 
+import contextlib
 import shlex
 import signal
 import sys
@@ -9,12 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from segvisrl_jax.cli import FAILURE, INTERRUPTED, parse
-from segvisrl_jax.config import ConfigError, PresetName, require, require_folder_can_be_made
+from segvisrl_jax.config import ConfigError, NotWrittenError, PresetName, require, require_folder_can_be_made
 from segvisrl_jax.sweep.plan import parse_axis
 
 if TYPE_CHECKING:
     from segvisrl_jax.sweep.engines import Ended
     from segvisrl_jax.sweep.plan import Trial
+    from segvisrl_jax.sweep.trainings import Trainings
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,8 @@ def run(options: Sequence[str]) -> int:
     """Parses, checks every trial, trains what is missing, writes table and plot."""
     from segvisrl_jax.commands.train import parse_config
     from segvisrl_jax.sweep.plan import check_trials, plan_trials
-    from segvisrl_jax.sweep.results import DONE, in_words, result_row, write_csv
+    from segvisrl_jax.sweep.results import DONE, in_words, result_row, why_unfinished, write_csv
+    from segvisrl_jax.sweep.trainings import Trainings
 
     asked = parse(SweepOptions, options, "sweep")
     words = ["--preset", asked.preset, *(["--steps", str(asked.steps)] if asked.steps else [])]
@@ -73,22 +76,33 @@ def run(options: Sequence[str]) -> int:
     def note(trial: "Trial", status: str, node: str) -> str:
         found[trial.name] = result_row(trial, asked.output / trial.name, status, node)
         known = [other for other in trials if other.name in found]
-        write_csv(asked.output / "results.csv", known, [found[other.name] for other in known])
+        with contextlib.suppress(NotWrittenError):  # the last time counts
+            write_csv(asked.output / "results.csv", known, [found[other.name] for other in known])
         return in_words(trial, found[trial.name])
 
-    missing = [trial for trial in trials if not _is_finished(asked.output / trial.name)]
+    missing = []
     for trial in trials:
-        if trial not in missing:
+        why = why_unfinished(asked.output / trial.name)
+        missing += [trial] if why else []
+        if not why:
             print(f"  {note(trial, DONE, '')} (already there)")
-    _train(asked, missing, note)
-    return _report(asked, [axis.label for axis in axes], [found[trial.name] for trial in trials])
+        elif (asked.output / trial.name / "eval.json").exists():
+            print(f"  {why}: goes on")
+    trainings = Trainings()
+    with trainings if asked.engine == "local" else contextlib.nullcontext():
+        _train(asked, missing, note, trainings)
+    rows = [found[trial.name] for trial in trials]
+    write_csv(asked.output / "results.csv", trials, rows)
+    code = _report(asked, [axis.label for axis in axes], rows)
+    return INTERRUPTED if code and trainings.is_stopping else code
 
 
-def _is_finished(run_dir: Path) -> bool:
-    return (run_dir / "eval.json").is_file()
-
-
-def _train(asked: SweepOptions, missing: "Sequence[Trial]", note: "Callable[[Trial, str, str], str]") -> None:
+def _train(
+    asked: SweepOptions,
+    missing: "Sequence[Trial]",
+    note: "Callable[[Trial, str, str], str]",
+    trainings: "Trainings",
+) -> None:
     """Runs the trials under a bar, with a line for each that ends."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -99,24 +113,25 @@ def _train(asked: SweepOptions, missing: "Sequence[Trial]", note: "Callable[[Tri
         bar = progress.add_task("sweep", total=len(missing))
         counted = f"{len(missing)} run{'' if len(missing) == 1 else 's'}"
         progress.console.print(f"{counted}; logs in {asked.output}", highlight=False)
-        for trial, ended in _ends(asked, missing):
+        for trial, ended in _ends(asked, missing, trainings):
             progress.console.print(f"  {note(trial, _status(asked, trial, ended), ended.node)}", highlight=False)
             progress.advance(bar)
 
 
-def _ends(asked: SweepOptions, missing: "Sequence[Trial]") -> "Iterator[tuple[Trial, Ended]]":
+def _ends(asked: SweepOptions, missing: "Sequence[Trial]", trainings: "Trainings") -> "Iterator[tuple[Trial, Ended]]":
     from segvisrl_jax.sweep.engines import run_local, run_ray
 
     if asked.engine == "local":
-        return run_local(missing, asked.output, asked.jobs)
+        return run_local(missing, asked.output, asked.jobs, trainings)
     return run_ray(missing, asked.output, asked.ray_address, asked.cpus_per_run, asked.gpus_per_run)
 
 
 def _status(asked: SweepOptions, trial: "Trial", ended: "Ended") -> str:
-    from segvisrl_jax.sweep.results import DONE
+    from segvisrl_jax.sweep.results import DONE, why_unfinished
 
-    if ended.code == 0 and _is_finished(asked.output / trial.name):
-        return DONE
+    if ended.code == 0:
+        why = why_unfinished(asked.output / trial.name)
+        return f"failed ({why}; remove it, and it is trained again)" if why else DONE
     if ended.code in (INTERRUPTED, -signal.SIGINT, -signal.SIGTERM):
         return "stopped"
     return f"failed ({ended.trouble or ended.code})"

@@ -26,6 +26,7 @@ from segvisrl_jax.config import (
     require_file_can_be_written,
 )
 from segvisrl_jax.report.table import Evaluation, results_table
+from segvisrl_jax.training.output import write_output
 from segvisrl_jax.training.statistics import wilson_interval
 
 OUTCOMES = ("success", "collision", "fall", "timeout", "unstable")
@@ -61,7 +62,7 @@ def run(options: Sequence[str]) -> int:
     if asked.output is None:
         print(page, end="")
     else:
-        asked.output.write_text(page)
+        write_output(asked.output, page)
         print(asked.output)
     return 0
 

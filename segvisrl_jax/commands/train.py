@@ -5,7 +5,7 @@ import math
 import os
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,6 +18,8 @@ from segvisrl_jax.config import (
     TrainConfig,
     flatten,
     from_dict,
+    is_disk_trouble,
+    one_line,
     option_words,
     preset_config,
     read_json,
@@ -51,7 +53,7 @@ def run(options: Sequence[str]) -> int:
     going_on = f"Go on with:\n  {resume_command(config)}"
     try:
         with _told_where_memory_ends(config):
-            result = train(config, when_late=lambda said: _end_now(f"{said} {going_on}"))
+            result = train(config, _say, when_late=lambda said: _end_now(f"{said} {going_on}"))
     except DivergedError as error:
         print(f"segvisrl train: {error}", file=sys.stderr)
         return FAILURE
@@ -63,11 +65,14 @@ def run(options: Sequence[str]) -> int:
     if not result.finished:
         print(f"Stopped and saved after {result.decisions:,} decisions. {going_on}")
         return INTERRUPTED
-    for each, run_dir in zip(config.runs, result.run_dirs, strict=True):
-        _finish(each, run_dir)
-    if config.num_seeds > 1:
-        print(f"All seeds: {_draw_together(config, result.run_dirs)}")
-    return 0
+    return _leave_products(config, result.run_dirs)
+
+
+def _say(line: str) -> None:
+    from segvisrl_jax.training.metrics import going_on_where_output_fails
+
+    with going_on_where_output_fails():
+        print(line)
 
 
 def resume_command(config: TrainConfig) -> str:
@@ -83,8 +88,9 @@ def resume_command(config: TrainConfig) -> str:
 
 def _end_now(said: str) -> None:
     """Ends the process from whichever thread, whatever the others do; the terminal gets its cursor back."""
-    sys.stdout.write((SHOW_CURSOR if sys.stdout.isatty() else "") + f"\n{said}\n")
-    sys.stdout.flush()
+    with contextlib.suppress(OSError):  # the terminal may be gone
+        sys.stdout.write((SHOW_CURSOR if sys.stdout.isatty() else "") + f"\n{said}\n")
+        sys.stdout.flush()
     os._exit(INTERRUPTED)
 
 
@@ -210,28 +216,78 @@ def _short(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else f"{value:,}" if isinstance(value, int) else str(value)
 
 
-def _draw_together(config: TrainConfig, run_dirs: Sequence[Path]) -> Path:
+def _together(config: TrainConfig) -> Path:
+    return Path(config.runs_dir) / f"{config.run_name}-learning_curves.png"
+
+
+def _draw_together(config: TrainConfig, run_dirs: Sequence[Path]) -> None:
     """The learning curves of all seeds: the median and a band."""
     from segvisrl_jax.report.learning_curves import draw_learning_curves, read_curves
 
-    path = Path(config.runs_dir) / f"{config.run_name}-learning_curves.png"
-    return draw_learning_curves(read_curves(run_dirs), path)
+    print(f"All seeds: {draw_learning_curves(read_curves(run_dirs), _together(config))}")
 
 
-def _finish(config: TrainConfig, run_dir: Path) -> None:
-    """Test scenes, learning curve, video, and what to type next."""
+def _leave_products(config: TrainConfig, run_dirs: Sequence[Path]) -> int:
+    """What is made of finished runs; gives the exit code. What fails or is stopped here costs no training."""
+    from segvisrl_jax.training.stop_signals import StopSignals
+
+    again = resume_command(config)
+    told = f"The training is complete and saved. Its evaluation, curve and video are made with:\n  {again}"
+    missing: list[str] = []
+    with StopSignals(grace_s=0.0, late=lambda at_once: _end_now(told)):
+        for each, run_dir in zip(config.runs, run_dirs, strict=True):
+            missing += _finish(each, run_dir)
+        if config.num_seeds > 1:
+            missing += _not_made({_together(config): lambda: _draw_together(config, run_dirs)}).values()
+    if not missing:
+        return 0
+    said = f"the training is complete and saved, but not made: {'; '.join(missing)}; made with: {again}"
+    print(f"segvisrl train: {said}", file=sys.stderr)
+    return FAILURE
+
+
+def _finish(config: TrainConfig, run_dir: Path) -> list[str]:
+    """Test scenes, learning curve, video, and what to type next; gives what could not be made, and why."""
     from segvisrl_jax.commands import demo
-    from segvisrl_jax.commands.eval import EvalOptions, as_json, evaluate, report_line
     from segvisrl_jax.report.figures import learning_curve
+
+    curve, video = run_dir / "learning_curve.png", run_dir / "rollout.mp4"
+    made: dict[Path, Callable[[], object]] = {
+        run_dir / "eval.json": lambda: _test(config, run_dir),
+        curve: lambda: learning_curve([run_dir], curve),
+        video: lambda: demo.record(demo.DemoOptions(run=run_dir, output=video)),
+    }
+    failed = _not_made(made)
+    for path in (run_dir / "config.json", run_dir / "metrics.jsonl", *made, run_dir / "policy"):
+        if path not in failed:
+            print(f"  {path}{os.sep if path.is_dir() else ''}")
+    named = shlex.quote(str(run_dir))
+    print(f"Next: segvisrl eval --run {named} --episodes 1000    or    segvisrl demo --run {named} --scene 1")
+    return list(failed.values())
+
+
+def _test(config: TrainConfig, run_dir: Path) -> None:
+    """Drives test scenes with a finished run, says how well, and writes it down."""
+    from segvisrl_jax.commands.eval import EvalOptions, as_json, evaluate, report_line
+    from segvisrl_jax.training.output import write_output
 
     episodes = min(TEST_EPISODES, 5 * config.evaluation.episodes)  # fewer after a smoke test
     slots = config.evaluation.num_slots
     result = evaluate(EvalOptions(run=run_dir, episodes=episodes, seed=TEST_SEED, slots=slots))
-    (run_dir / "eval.json").write_text(as_json(result))
-    learning_curve([run_dir], run_dir / "learning_curve.png")
-    demo.record(demo.DemoOptions(run=run_dir, output=run_dir / "rollout.mp4"))
     print(f"\n{episodes} test scenes: {report_line(result)}")
-    for name in ("config.json", "metrics.jsonl", "eval.json", "learning_curve.png", "rollout.mp4", "policy/"):
-        print(f"  {run_dir / name}")
-    named = shlex.quote(str(run_dir))
-    print(f"Next: segvisrl eval --run {named} --episodes 1000    or    segvisrl demo --run {named} --scene 1")
+    write_output(run_dir / "eval.json", as_json(result))
+
+
+def _not_made(products: dict[Path, Callable[[], object]]) -> dict[Path, str]:
+    """Makes each file; those that could not be made, each with its name and the reason."""
+    failed = {}
+    for path, make in products.items():
+        try:
+            make()
+        except ConfigError as error:
+            failed[path] = f"{path} ({one_line(error)})"
+        except OSError as error:
+            if not is_disk_trouble(error):
+                raise
+            failed[path] = f"{path} ({error.strerror or error})"
+    return failed

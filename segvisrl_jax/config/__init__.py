@@ -18,7 +18,12 @@ from segvisrl_jax.config.names import (
     PresetName,
     RendererName,
 )
-from segvisrl_jax.config.paths import require_file_can_be_written, require_folder_can_be_made
+from segvisrl_jax.config.paths import (
+    NotWrittenError,
+    is_disk_trouble,
+    require_file_can_be_written,
+    require_folder_can_be_made,
+)
 from segvisrl_jax.config.presets import preset_config
 from segvisrl_jax.config.tree import flatten, from_dict, option_words, replace_fields, to_dict
 
@@ -35,6 +40,7 @@ __all__ = [
     "EvaluationConfig",
     "LoggerName",
     "NetworkConfig",
+    "NotWrittenError",
     "ObservationKind",
     "PPOConfig",
     "PhysicsConfig",
@@ -45,6 +51,7 @@ __all__ = [
     "TrainConfig",
     "flatten",
     "from_dict",
+    "is_disk_trouble",
     "is_finite",
     "is_plain_text",
     "one_line",

@@ -5,6 +5,7 @@ Colours are those of Okabe and Ito, which colour-blind readers can tell apart. F
 are in ``scene_figures``.
 """
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +19,7 @@ from matplotlib.ticker import EngFormatter, PercentFormatter
 from segvisrl_jax.config import require
 from segvisrl_jax.training.metrics import METRICS_FILE, STEP_KEY
 from segvisrl_jax.training.metrics_rows import read_rows
+from segvisrl_jax.training.output import write_output
 
 DOTS_PER_INCH = 100  # so a figure of 10 inches is 1000 pixels wide
 SHARP_DOTS_PER_INCH = 160  # of the figures of the results page, which are read closely
@@ -208,5 +210,7 @@ def save_figure(figure: Figure, path_png: Path, dots_per_inch: int = DOTS_PER_IN
     path = Path(path_png)
     require(path.suffix == ".png", "path_png", str(path), "a name that ends in .png")
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=dots_per_inch)
+    drawn = io.BytesIO()
+    figure.savefig(drawn, dpi=dots_per_inch, format="png")
+    write_output(path, drawn.getvalue())
     return path

@@ -5,6 +5,7 @@ The CSV holds all that the figure is drawn from, so that it can be drawn again w
 
 import csv
 import hashlib
+import io
 import json
 import math
 from collections.abc import Sequence
@@ -24,6 +25,7 @@ from segvisrl_jax.report.lines import BAND_ALPHA, LineEnd, method_colours, name_
 from segvisrl_jax.report.recipe import recipe
 from segvisrl_jax.training.metrics import METRICS_FILE, STEP_KEY
 from segvisrl_jax.training.metrics_rows import MOST_DECISIONS, read_rows
+from segvisrl_jax.training.output import write_output
 
 POINTS = 200  # of a run's return at most: more than a figure can show
 LOG_FROM = 4.0  # the longest run over the shortest, from which on decisions are on a logarithmic axis
@@ -120,15 +122,16 @@ def _thinned(series: Series) -> Series:
 def write_curves(curves: Sequence[Curve], path_csv: Path) -> Path:
     """Writes ``COLUMNS``: a row for every place where a run has a number, the others' cells empty."""
     path_csv.parent.mkdir(parents=True, exist_ok=True)
-    with path_csv.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        for curve in curves:
-            returns, success = (dict(zip(*series, strict=True)) for series in (curve.returns, curve.success))
-            for decisions in sorted({*returns, *success}):
-                numbers = [_cell(returns.get(decisions)), _cell(success.get(decisions))]
-                cells = [curve.arch, curve.recipe, curve.run, curve.seed, f"{decisions:.0f}", *numbers]
-                writer.writerow(cells)
+    written = io.StringIO()
+    writer = csv.writer(written, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for curve in curves:
+        returns, success = (dict(zip(*series, strict=True)) for series in (curve.returns, curve.success))
+        for decisions in sorted({*returns, *success}):
+            numbers = [_cell(returns.get(decisions)), _cell(success.get(decisions))]
+            cells = [curve.arch, curve.recipe, curve.run, curve.seed, f"{decisions:.0f}", *numbers]
+            writer.writerow(cells)
+    write_output(path_csv, written.getvalue())
     return path_csv
 
 

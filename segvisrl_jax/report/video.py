@@ -5,6 +5,7 @@ Images are uint8 RGB arrays (H, W, 3). This file draws with PIL and runs no simu
 
 import functools
 import itertools
+import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 from segvisrl_jax.config import require
 from segvisrl_jax.report import layout
 from segvisrl_jax.report.layout import SceneMap
+from segvisrl_jax.training.output import write_output
 
 Frame = UInt8[np.ndarray, "H W 3"]
 
@@ -59,7 +61,10 @@ def write_video(path: Path, frames: Iterable[Frame], fps: float | int) -> Path:
     require(len(begin) == 1, "frames", "none", "at least one")
     path.parent.mkdir(parents=True, exist_ok=True)
     write = _write_mp4 if path.suffix == ".mp4" else _write_gif
-    write(path, itertools.chain(begin, remaining), float(fps))
+    with tempfile.TemporaryDirectory() as folder:  # FFmpeg goes back to a file's beginning, by its name
+        made = Path(folder) / f"video{path.suffix}"
+        write(made, itertools.chain(begin, remaining), float(fps))
+        write_output(path, made.read_bytes())
     return path
 
 

@@ -15,13 +15,14 @@ import subprocess
 import sys
 import tarfile
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from segvisrl_jax.config import ConfigError
 from segvisrl_jax.sweep.plan import Trial
+from segvisrl_jax.sweep.trainings import Trainings
 
 MARKER = ".sweep"  # holds a random word: who can read it sees the same disk
 STOP_SECONDS = 60  # what a run that is told to stop has to write its checkpoint
@@ -37,16 +38,27 @@ class Ended(NamedTuple):
     trouble: str = ""
 
 
-def run_local(trials: Sequence[Trial], output: Path, jobs: int) -> Iterator[tuple[Trial, Ended]]:
-    """Runs trials in processes of this machine, ``jobs`` at a time, and yields each as it ends."""
+def run_local(trials: Sequence[Trial], output: Path, jobs: int, trainings: Trainings) -> Iterator[tuple[Trial, Ended]]:
+    """Runs trials in processes of this machine, ``jobs`` at a time, and yields each as it ends.
+
+    Once ``trainings`` is told to stop, those that run end soon, and the others are not started.
+    """
     environment = sharing_a_gpu(1 / jobs)
-    pool = ThreadPoolExecutor(jobs)
-    waiting = {pool.submit(train_in, output, trial, environment): trial for trial in trials}
-    try:
+    with ThreadPoolExecutor(jobs) as pool:
+        waiting = {pool.submit(_train_here, output, trial, environment, trainings): trial for trial in trials}
         for future in as_completed(waiting):
-            yield waiting[future], Ended(future.result(), socket.gethostname())
-    finally:
-        pool.shutdown(cancel_futures=True)  # after Ctrl-C the processes, which heard it too, save and end
+            yield waiting[future], future.result()
+
+
+def _train_here(output: Path, trial: Trial, environment: dict[str, str], trainings: Trainings) -> Ended:
+    node, stopped = socket.gethostname(), -signal.SIGTERM
+    if trainings.is_stopping:
+        return Ended(stopped, node)
+    try:
+        code = train_in(output, trial, environment, trainings.start)
+    except OSError as error:  # neither a log nor a process
+        return Ended(1, node, error.strerror or str(error))
+    return Ended(stopped if trainings.is_stopping and code == -signal.SIGKILL else code, node)
 
 
 def sharing_a_gpu(share: float) -> dict[str, str]:
@@ -57,13 +69,18 @@ def sharing_a_gpu(share: float) -> dict[str, str]:
     return environment
 
 
-def train_in(folder: Path, trial: Trial, environment: dict[str, str]) -> int:
+def train_in(
+    folder: Path,
+    trial: Trial,
+    environment: dict[str, str],
+    start: "Callable[..., subprocess.Popen[Any]]" = subprocess.Popen,
+) -> int:
     """Trains one trial in ``folder`` to its end, from its last checkpoint where there is one; the exit code."""
     words = ["--run", trial.name, "--runs-dir", str(folder)]
     words = [*words, "--resume"] if (folder / trial.name / "config.json").is_file() else [*trial.words, *words]
     command = [sys.executable, "-m", "segvisrl_jax.cli", "train", *words]
     with (folder / f"{trial.name}.log").open("a") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
+        process = start(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
         try:
             return process.wait()
         except BaseException:  # told to stop: the run shall save itself

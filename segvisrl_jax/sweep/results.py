@@ -1,6 +1,7 @@
 """What a sweep found: one row for each trial, as a CSV file and in words."""
 
 import csv
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 from segvisrl_jax.config import ConfigError, is_finite, read_json, require
 from segvisrl_jax.sweep.plan import Trial
 from segvisrl_jax.training.metrics_rows import read_rows
+from segvisrl_jax.training.output import write_output
 
 SCORES = ("success", "success_low", "success_high", "collision", "fall", "timeout", "spl", "decisions_per_second")
 DONE = "done"
@@ -17,6 +19,15 @@ def result_row(trial: Trial, run_dir: Path, status: str, node: str) -> dict[str,
     """A trial's row: its values, its status, where it ran, and its scores on test scenes if it is done."""
     row: dict[str, Any] = {**trial.values, "status": status, "node": node}
     return {**row, **_scores(run_dir)} if status == DONE else row
+
+
+def why_unfinished(run_dir: Path) -> str:
+    """Why a run is not finished, in one line; "" where it is, with scores that can be read."""
+    try:
+        _scores(run_dir)
+    except ConfigError as error:
+        return str(error)
+    return ""
 
 
 def _scores(run_dir: Path) -> dict[str, float]:
@@ -37,16 +48,17 @@ def _scores(run_dir: Path) -> dict[str, float]:
         for name, value in scores.items():
             require(is_finite(value), name, value, "a finite number")
     except (OSError, ValueError, KeyError, IndexError, TypeError, ArithmeticError) as error:
-        raise ConfigError(f"{run_dir}: not a finished run ({error}); remove it, and it is trained again") from None
+        raise ConfigError(f"{run_dir}: not a finished run ({error})") from None
     return scores
 
 
 def write_csv(path: Path, trials: Sequence[Trial], rows: Sequence[dict[str, Any]]) -> None:
     """The table of runs, in the order of the plan; what a run has no number for stays empty."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [*trials[0].values, "status", "node", *SCORES])
-        writer.writeheader()
-        writer.writerows(rows)
+    written = io.StringIO()
+    writer = csv.DictWriter(written, [*trials[0].values, "status", "node", *SCORES])
+    writer.writeheader()
+    writer.writerows(rows)
+    write_output(path, written.getvalue())
 
 
 def in_words(trial: Trial, row: dict[str, Any]) -> str:

@@ -1,18 +1,49 @@
-"""Ctrl-C and SIGTERM end a run in order: after the current update, with everything saved."""
+"""Ctrl-C, SIGTERM and a closed terminal end a run in order: after the current update, with everything saved."""
 
+import contextlib
+import os
 import select
 import signal
 import socket
+import stat
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 GRACE_S = 5.0  # clouds give 30 s or more before they take a machine away, container runtimes 10
 
 
+def stop_signals() -> tuple[int, ...]:
+    """SIGINT, SIGTERM, and SIGHUP (the terminal was closed) unless it is ignored, as ``nohup`` has it."""
+    if not hasattr(signal, "SIGHUP") or signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:  # Windows has none
+        return signal.SIGINT, signal.SIGTERM
+    return signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+
+
+@contextlib.contextmanager
+def handlers_for(hear: Callable[[int, Any], object]) -> Iterator[None]:
+    """Has every stop signal call a function, and puts what was there before back."""
+    before = {number: signal.signal(number, hear) for number in stop_signals()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def leave_closed_terminal() -> None:
+    """Sends output nowhere whose terminal was closed: writing to that fails, and would end what is to be saved."""
+    for output in (1, 2):
+        with contextlib.suppress(OSError):
+            if stat.S_ISCHR(os.fstat(output).st_mode) and not os.isatty(output):
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, output)
+                os.close(nowhere)
+
+
 class StopSignals:
-    """While open, the first SIGINT or SIGTERM asks to stop after the current update; a second one ends at once.
+    """While open, the first SIGINT, SIGTERM or SIGHUP asks to stop after the current update; a second one ends at once.
 
     An update or a compilation may take longer than a machine that is being taken away grants, and Python's own handlers
     wait until a compiled program returns; so a thread watches.
@@ -27,7 +58,8 @@ class StopSignals:
     def __init__(self, grace_s: float = GRACE_S, late: Callable[[bool], object] | None = None) -> None:
         self.requested = False
         self._grace_s, self._late = grace_s, late
-        self._before: dict[int, Any] = {}
+        self._handlers = handlers_for(self._request)
+        self._numbers = stop_signals()
         self._wakeup_before = -1
         self._sockets: tuple[socket.socket, socket.socket] | None = None
         self._watcher: threading.Thread | None = None
@@ -35,13 +67,11 @@ class StopSignals:
     def __enter__(self) -> "StopSignals":
         if self._late is not None:
             self._watch()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._before[number] = signal.signal(number, self._request)
+        self._handlers.__enter__()
         return self
 
     def __exit__(self, *error: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
+        self._handlers.__exit__(None, None, None)
         if self._sockets is not None:
             signal.set_wakeup_fd(self._wakeup_before)
             told, tells = self._sockets
@@ -51,6 +81,7 @@ class StopSignals:
             told.close()
 
     def _request(self, number: int, frame: object) -> None:
+        leave_closed_terminal()
         if self.requested and self._late is None:
             raise KeyboardInterrupt
         self.requested = True
@@ -76,7 +107,9 @@ class StopSignals:
             numbers = told.recv(64)
             if not numbers:  # closed: nothing to watch any more
                 return None
-            asked = sum(number in (signal.SIGINT, signal.SIGTERM) for number in numbers)
+            asked = sum(number in self._numbers for number in numbers)
+            if asked:
+                leave_closed_terminal()
             if asked > 1 or (asked and deadline is not None):
                 return self._late(True)
             if asked:

@@ -1,16 +1,20 @@
 """The program as a user types it: what it prints, what it leaves, and one line for every mistake."""
 
+import errno
 import json
 import os
 import shlex
 import subprocess
 import sys
+from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 
 from segvisrl_jax.cli import main
+from segvisrl_jax.commands import doctor
 from segvisrl_jax.commands.train import parse_config, resume_command, rocks_in_scenes
-from segvisrl_jax.config import preset_config, replace_fields, to_dict
+from segvisrl_jax.config import NotWrittenError, preset_config, replace_fields, to_dict
 from segvisrl_jax.cpu import num_cores
 from segvisrl_jax.training.run import open_run_dir
 
@@ -101,6 +105,47 @@ def test_a_reader_that_has_had_enough_is_no_failure(tmp_path):
     said = process.stderr.read()
     assert process.wait(60) == 141
     assert said == ""
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "No space left on device"),
+        (OSError(errno.EROFS, "Read-only file system", "here"), "'here': Read-only file system"),
+        (OSError(errno.EIO, "Input/output error", b"here"), "'here': Input/output error"),
+        (NotWrittenError(errno.ENOENT, "No such file or directory", "here"), "'here': cannot be written (No such file"),
+    ],
+)
+def test_a_disk_that_fails_ends_in_one_line(error, said, monkeypatch, capsys):
+    monkeypatch.setattr(doctor, "run", MagicMock(side_effect=error))
+    assert main(["doctor"]) == 1
+    shown = capsys.readouterr().err
+    assert shown.startswith(f"segvisrl doctor: {said}")
+    assert shown.count("\n") == 1
+
+
+def test_a_working_folder_that_is_gone_ends_in_one_line(tmp_path):
+    gone = f"import os, sys; os.chdir({str(tmp_path / 'gone')!r}); os.rmdir(os.getcwd())\n"
+    (tmp_path / "gone").mkdir()
+    code = gone + "from segvisrl_jax.cli import main; sys.exit(main(['train', '--preset', 'smoke']))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
+
+
+@pytest.mark.parametrize(
+    "error", [FileNotFoundError(errno.ENOENT, "No such file", "here"), KeyError("here"), OSError()]
+)
+def test_the_programs_own_errors_keep_their_traceback(error, monkeypatch):
+    monkeypatch.setattr(doctor, "run", MagicMock(side_effect=error))
+    with pytest.raises(type(error)):
+        main(["doctor"])
+
+
+def test_output_onto_a_full_disk_ends_in_one_line(tmp_path):
+    command = [sys.executable, "-m", "segvisrl_jax.cli", "runs", str(tmp_path)]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (1, "segvisrl runs: No space left on device\n")
 
 
 @pytest.mark.slow

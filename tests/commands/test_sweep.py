@@ -4,18 +4,24 @@ import csv
 import io
 import json
 import os
+import signal
 import subprocess
 import sys
 import tarfile
+import time
 from pathlib import Path
 
 import pytest
 
 from segvisrl_jax.cli import main
+from segvisrl_jax.sweep import engines
 from segvisrl_jax.sweep.engines import pack, sharing_a_gpu, train_on_node, unpack
 from segvisrl_jax.sweep.plan import parse_axis, plan_trials
+from segvisrl_jax.training.metrics import read_metrics
+from segvisrl_jax.training.run_lock import is_being_trained
 
 TINY = ("--arch", "mlp", "--evaluation.episodes", "1", "--env.task.max-decisions", "10")
+PATIENCE_S, ENDS_WITHIN_S = 600.0, 30.0
 SMALL = ("--preset", "smoke", "--steps", "128", f"--args={' '.join(TINY)}", "--output", "sweep")
 
 
@@ -50,6 +56,93 @@ def test_sweep_goes_on_where_it_was_and_reports_failures(tmp_path):
     assert 0 <= float(rows[0]["success"]) <= 1
     assert float(rows[0]["decisions_per_second"]) > 0
     assert (tmp_path / "sweep" / "sweep.png").stat().st_size > 0
+
+
+def finish(folder, trial, environment, start=None):
+    """Stands for a training: leaves what a finished run has of it."""
+    (folder / trial.name).mkdir(exist_ok=True)
+    (folder / trial.name / "metrics.jsonl").write_text('{"step": 128, "time/seconds": 2.0}\n')
+    (folder / trial.name / "eval.json").write_text('{"success": 0.5, "success_ci95": [0.1, 0.9]}')
+    return 0
+
+
+@pytest.mark.parametrize("damaged", ["", "{", "[]", '{"success": 0.5}', '{"success": null, "success_ci95": [0, 1]}'])
+def test_an_evaluation_that_cannot_be_read_is_made_again(damaged, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    [first, _] = trials = plan_trials([parse_axis("seed=0,1")], [])
+    (tmp_path / "sweep").mkdir()
+    finish(tmp_path / "sweep", first, {})
+    (tmp_path / "sweep" / "seed0" / "eval.json").write_text(damaged)
+    trained = []
+    monkeypatch.setattr(engines, "train_in", lambda *asked: trained.append(asked[1].name) or finish(*asked))
+    assert main(["sweep", *SMALL, "--vary", "seed=0,1"]) == 0
+    assert sorted(trained) == [trial.name for trial in trials]
+    assert [row["status"] for row in read_rows(tmp_path)] == ["done", "done"]
+    assert "seed0: not a finished run" in capsys.readouterr().out
+
+
+def test_a_run_whose_numbers_stay_unreadable_has_failed_and_others_go_on(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+
+    def train(folder, trial, environment, start):
+        finish(folder, trial, environment)
+        if trial.name == "seed0":
+            (folder / trial.name / "metrics.jsonl").write_text("")
+        return 0
+
+    monkeypatch.setattr(engines, "train_in", train)
+    assert main(["sweep", *SMALL, "--vary", "seed=0,1"]) == 1
+    failed, done = [row["status"] for row in read_rows(tmp_path)]
+    assert done == "done"
+    assert failed.startswith("failed (sweep/seed0: not a finished run (")
+    assert failed.endswith("; remove it, and it is trained again)")
+
+
+def test_a_table_that_cannot_be_written_ends_no_sweep_before_its_end(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sweep" / "results.csv.partial").mkdir(parents=True)
+    trained = []
+    monkeypatch.setattr(engines, "train_in", lambda *asked: trained.append(asked[1].name) or finish(*asked))
+    assert main(["sweep", *SMALL, "--vary", "seed=0,1"]) == 1
+    assert trained == ["seed0", "seed1"]
+    said = capsys.readouterr().err
+    assert said == "segvisrl sweep: 'sweep/results.csv': cannot be written (Is a directory)\n"
+
+
+def num_updates(run):
+    return len(read_metrics(run)) if (run / "metrics.jsonl").exists() else 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_the_sweep_alone_stops_its_trainings_in_order(number, tmp_path):
+    long = ("--preset", "smoke", "--steps", "1000000", f"--args={' '.join(TINY)}", "--output", "sweep")
+    command = [sys.executable, "-m", "segvisrl_jax.cli", "sweep", *long, "--vary", "seed=0,1,2", "--jobs", "2"]
+    heed = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler)}
+    runs = [tmp_path / "sweep" / f"seed{seed}" for seed in range(3)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    with subprocess.Popen(command, cwd=tmp_path, env=environment, **pipes, **heed) as process:
+        try:
+            until = time.monotonic() + PATIENCE_S
+            while not all(num_updates(run) >= 3 for run in runs[:2]):
+                assert process.poll() is None
+                assert time.monotonic() < until
+                time.sleep(0.1)
+            began = time.monotonic()
+            process.send_signal(number)
+            said = process.communicate(timeout=ENDS_WITHIN_S)
+            took_s = time.monotonic() - began
+        finally:
+            process.kill()
+    assert process.returncode == 130, said
+    assert took_s < ENDS_WITHIN_S
+    assert "Traceback" not in "".join(said)
+    assert [row["status"] for row in read_rows(tmp_path)] == ["stopped"] * 3
+    assert not any(is_being_trained(run) for run in runs)
+    assert not runs[2].exists()
+    for run in runs[:2]:
+        assert "Stopped and saved after" in run.with_suffix(".log").read_text()
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ been compiled. Prints a table; exit code 1 where memory grew by more than one pe
 """
 
 import argparse
-import contextlib
 import os
 import shlex
 import subprocess
@@ -104,8 +103,7 @@ def draw(frames: int) -> Soaked:
         for _ in range(FRAMES_A_RENDERER):
             np.asarray(look(state))
             memory.append(resident_mib())
-        with contextlib.suppress(AttributeError):
-            env.renderer.close()  # type: ignore[union-attr]
+        env.renderer.close()  # type: ignore[union-attr]
     return Soaked("gl", f"{rounds * FRAMES_A_RENDERER:,} frames, {rounds} renderers", None, memory)
 
 

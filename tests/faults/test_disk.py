@@ -12,12 +12,26 @@ from unittest import mock
 import jax
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from segvisrl_jax import cli
-from segvisrl_jax.config import ConfigError, preset_config, replace_fields
+from segvisrl_jax.commands import eval as eval_command
+from segvisrl_jax.config import (
+    ConfigError,
+    NotWrittenError,
+    preset_config,
+    replace_fields,
+    require_file_can_be_written,
+)
+from segvisrl_jax.report.figures import save_figure
+from segvisrl_jax.report.learning_curves import Curve, Series, write_curves
+from segvisrl_jax.report.video import write_video
+from segvisrl_jax.sweep.plan import Trial
+from segvisrl_jax.sweep.results import write_csv
 from segvisrl_jax.training import loop, run
 from segvisrl_jax.training.checkpoint import Checkpoints, load_policy
 from segvisrl_jax.training.metrics import read_metrics
+from segvisrl_jax.training.output import write_output
 
 DISK_MB = 8  # room for the first checkpoints of this small run, and little more
 SMALL = {"num_envs": 4, "unroll_length": 8, "num_minibatches": 2, "max_decisions": 10, "mlp_sizes": (8, 8)}
@@ -259,3 +273,89 @@ def test_a_folder_without_permission_is_refused_in_one_line(tmp_path):
     assert ended.stderr.count("\n") == 1
     assert "should be where this user may write" in ended.stderr
     assert not list((tmp_path / "locked").iterdir())
+
+
+WORDS = ("--ppo.num-envs", "4", "--ppo.unroll-length", "8", "--network.mlp-sizes", "8", "8", "--steps", "64")
+PRODUCTS = ("eval.json", "learning_curve.png", "rollout.mp4")
+
+
+@pytest.mark.slow
+def test_a_finished_run_whose_products_cannot_be_written_is_complete(disk, monkeypatch, capsys):
+    drive = eval_command.evaluate
+    monkeypatch.setattr(eval_command, "evaluate", lambda asked: fill(disk) or drive(asked))
+    named = ["--runs-dir", str(disk), "--run", "run"]
+    assert cli.main(["train", "--arch", "mlp", "--preset", "smoke", *named, *WORDS]) == 1
+    told = capsys.readouterr()
+    [line] = told.err.splitlines()
+    assert line.startswith("segvisrl train: the training is complete and saved, but not made: ")
+    assert all(f"{disk}/run/{name} (No space left on device)" in line for name in PRODUCTS)
+    assert "test scenes: success" in told.out
+    assert not {path.name for path in (disk / "run").iterdir()} & {*PRODUCTS, *(f"{name}.partial" for name in PRODUCTS)}
+    monkeypatch.undo()
+    (disk / "filler").unlink()
+    command = line.partition("; made with: segvisrl ")[2].split()
+    assert cli.main(command) == 0
+    assert all((disk / "run" / name).stat().st_size for name in PRODUCTS)
+
+
+def test_an_evaluation_that_cannot_be_written_leaves_the_one_before(disk, capsys):
+    (disk / "old.json").write_text("before")
+    fill(disk)
+    words = ["eval", "--controller", "random", "--episodes", "2", "--slots", "2", "--json", str(disk / "old.json")]
+    assert cli.main(words) == 1
+    said = capsys.readouterr().err
+    assert said == f"segvisrl eval: '{disk}/old.json': cannot be written (No space left on device)\n"
+    assert (disk / "old.json").read_text() == "before"
+    assert {path.name for path in disk.iterdir()} == {"old.json", "filler"}
+
+
+@pytest.mark.slow
+def test_a_log_on_a_full_disk_costs_no_training(tmp_path):
+    words = ["train", "--arch", "mlp", "--preset", "smoke", "--runs-dir", str(tmp_path), "--run", "run", *WORDS]
+    command = [sys.executable, "-m", "segvisrl_jax.cli", *words]
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONUNBUFFERED": ""}
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, env=environment)
+    assert (done.returncode, done.stderr) == (1, "segvisrl train: No space left on device\n")
+    assert newest_checkpoint(tmp_path) == 2
+    assert all((tmp_path / "run" / name).stat().st_size for name in PRODUCTS)
+
+
+TRIAL = Trial("seed0", {"seed": "0"}, ())
+CURVE = Curve("run", "mlp", "recipe", "run", 0, Series(*np.ones((2, 1))), Series(*np.ones((2, 1))))
+WRITERS = {  # of what commands leave: each is given the file's name
+    "a.csv": lambda path: write_csv(path, [TRIAL], [{"seed": "0", "status": "stopped", "node": ""}]),
+    "b.csv": lambda path: write_curves([CURVE], path),
+    "a.png": lambda path: save_figure(Figure(), path),
+    "a.mp4": lambda path: write_video(path, np.zeros((3, 32, 32, 3), np.uint8), 8),
+    "a.gif": lambda path: write_video(path, np.zeros((3, 32, 32, 3), np.uint8), 8),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_what_cannot_be_written_leaves_what_was_there(name, disk):
+    (disk / name).write_text("before")
+    fill(disk)
+    with pytest.raises(NotWrittenError, match=r"No space left on device: '.*" + name):
+        WRITERS[name](disk / name)
+    assert (disk / name).read_text() == "before"
+    assert {path.name for path in disk.iterdir()} == {name, "filler"}
+    (disk / "filler").unlink()
+    WRITERS[name](disk / name)
+    assert (disk / name).read_bytes() != b"before"
+
+
+def test_links_stay_links_and_what_is_no_file_is_written_to(tmp_path):
+    (tmp_path / "file").write_text("before")
+    (tmp_path / "link").symlink_to("file")
+    write_output(tmp_path / "link", "after")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "file").read_text() == "after"
+    write_output(Path("/dev/null"), "nothing")
+    assert Path("/dev/null").is_char_device()
+
+
+def test_a_name_without_room_for_its_ending_is_refused_at_once(tmp_path):
+    require_file_can_be_written(tmp_path / ("x" * 247), "--json")
+    with pytest.raises(ConfigError, match="a name of at most 247 bytes"):
+        require_file_can_be_written(tmp_path / ("x" * 248), "--json")

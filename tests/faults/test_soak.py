@@ -3,6 +3,8 @@
 import pytest
 from soak import MOST_GROWTH, Soaked, draw, drive, train
 
+from segvisrl_jax.vision import gl_context
+
 
 @pytest.mark.slow
 def test_random_driving_is_stable():
@@ -13,8 +15,21 @@ def test_random_driving_is_stable():
 
 @pytest.mark.slow
 @pytest.mark.gl
-def test_pictures_come_from_one_renderer_after_another():
+def test_pictures_come_from_one_renderer_after_another(monkeypatch):
+    opened, freed = [], []  # contexts: as they are kept here, none is freed because nobody has it any more
+    open_context = gl_context.open_gl_context
+
+    def open_counted(*size):
+        context = open_context(*size)
+        free = context.free
+        context.free = lambda: freed.append(context) or free()
+        opened.append(context)
+        return context
+
+    monkeypatch.setattr(gl_context, "open_gl_context", open_counted)
     assert len(draw(200).memory_mib) == 200
+    assert len(opened) == 2
+    assert freed == opened
 
 
 @pytest.mark.slow

@@ -1,10 +1,14 @@
 """SIGTERM and Ctrl-C end a training within ten seconds, saved, with a line that says how to go on: at any moment."""
 
+import fcntl
 import os
 import re
+import select
 import signal
 import subprocess
 import sys
+import termios
+import threading
 import time
 
 import pytest
@@ -100,6 +104,86 @@ def test_a_second_signal_ends_at_once_and_the_checkpoint_stays(tmp_path):
     assert (code, seconds < GRACE_S / 2) == (130, True), (code, seconds, said)
     assert "Traceback" not in said
     assert (training.run / "checkpoints" / "1" / "manifest.json").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_after_the_last_update_the_training_is_complete(number, tmp_path):
+    """While test scenes are driven and the video is made."""
+    training = Training(tmp_path, "--arch", "mlp", "--preset", "smoke", "--steps", "256")
+    training.wait_until(lambda: (training.run / "policy" / "policy.json").exists())
+    training.wait_until(lambda: not is_being_trained(training.run))
+    time.sleep(0.2)
+    seconds, code, said = training.stop(number)
+    assert (code, seconds < ENDS_WITHIN_S) == (130, True), (code, seconds, said)
+    assert "The training is complete and saved. Its evaluation, curve and video are made with:\n" in said
+    assert said.rstrip().endswith(f"segvisrl train --resume --runs-dir {tmp_path} --run run")
+    assert "Traceback" not in said
+    assert not (training.run / "rollout.mp4").exists()
+
+
+class OnTerminal(Training):
+    """A training on a terminal of its own."""
+
+    def __init__(self, folder, *options):
+        self.run, self.screen = folder / "run", []
+        self.terminal, its_side = os.openpty()
+        command = [sys.executable, "-m", "segvisrl_jax.cli", "train", "--runs-dir", str(folder), "--run", "run"]
+        self.process = subprocess.Popen(
+            [*command, *options], env={**os.environ, "JAX_PLATFORMS": "cpu", "TERM": "xterm"}, start_new_session=True,
+            stdin=its_side, stdout=its_side, stderr=its_side, preexec_fn=self._take_terminal,
+        )  # fmt: skip
+        os.close(its_side)
+        self._is_open = threading.Event()
+        self._is_open.set()
+        self._reader = threading.Thread(target=self._show)
+        self._reader.start()
+
+    @staticmethod
+    def _take_terminal():
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+    def _show(self):
+        while self._is_open.is_set():
+            if select.select([self.terminal], [], [], 0.05)[0]:
+                self.screen.append(os.read(self.terminal, 4096))
+
+    def close(self):
+        """As who closes the window: the system sends SIGHUP, and writing fails from then on."""
+        self._is_open.clear()
+        self._reader.join()
+        os.close(self.terminal)
+
+
+@pytest.mark.slow
+def test_a_terminal_that_is_closed_ends_a_training_in_order(tmp_path):
+    training = OnTerminal(tmp_path, *SHORT)
+    try:
+        training.wait_until(lambda: training.num_lines() >= 3)
+    finally:
+        training.close()
+    began = time.monotonic()
+    code = training.process.wait(PATIENCE_S)
+    assert (code, time.monotonic() - began < ENDS_WITHIN_S) == (130, True)
+    assert (training.run / "checkpoints" / str(training.num_lines()) / "manifest.json").exists()
+    assert b"\x1b[" in b"".join(training.screen)  # it did show its progress there
+
+
+def test_a_hangup_stops_a_run_unless_it_is_ignored(monkeypatch):
+    before = signal.getsignal(signal.SIGHUP)
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        with StopSignals(late=lambda at_once: None) as stop:
+            signal.raise_signal(signal.SIGHUP)
+            assert not stop.requested
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        with StopSignals(grace_s=30.0, late=lambda at_once: None) as stop:
+            signal.raise_signal(signal.SIGHUP)
+            assert stop.requested
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_handlers_are_put_back(tmp_path):

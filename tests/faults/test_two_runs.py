@@ -111,4 +111,12 @@ def test_a_run_that_trains_cannot_be_resumed_beside_itself(tmp_path):
         first.kill()
         first.wait()
     config = replace_fields(preset_config("mlp", "smoke"), runs_dir=str(tmp_path), run="run", steps=100000)
-    assert loop.open_run_dirs(replace_fields(config, resume=True)) is None
+    held = []
+
+    def look(line):
+        held.append(is_being_trained(tmp_path / "run"))
+
+    assert loop.train(replace_fields(config, resume=True, steps=256), say=look).finished
+    assert held
+    assert all(held)
+    assert not is_being_trained(tmp_path / "run")
