@@ -15,7 +15,9 @@ def make_callbacks_safe() -> None:
 
     Otherwise a program that waits for its callback can hold the very threads which the callback's
     arguments wait for, and hang (jax-ml/jax issues 24219, 25861). JAX reads this once, when its
-    first array is made: call it before that.
+    first array is made or its devices are asked for: call it before that. Whatever was chosen before is replaced, and
+    no environment variable sets it. Commands do this once their options are read, ``train`` at its beginning; the
+    engine, the renderers and the planner do for those who make them in other ways.
     """
     import jax  # here, so that every command may ask for the cores at no cost
 
