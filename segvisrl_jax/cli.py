@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from segvisrl_jax.config import ConfigError, NotWrittenError, is_disk_trouble
+from segvisrl_jax.cpu import make_callbacks_safe
 from segvisrl_jax.machine.memory import OutOfMemory, keep_freed_memory, one_line_where_memory_ends, what_there_is
 from segvisrl_jax.machine.programs import keep_compiled_programs
 
@@ -34,6 +35,7 @@ COMMANDS = {
     "doctor": "say whether this machine can do the work, how fast, and what to mend",
 }
 TIMED = ("bench",)  # compiles everything anew: it reports how long that takes
+WITHOUT_JAX = ("table", "runs", "sweep", "doctor")  # or that start it in their own time
 SMALLER = {  # what makes a command take less memory; train says more
     "eval": "--slots 32 drives fewer episodes at the same time",
     "bench": "smaller --batch and --batches, or a larger --scale, take less",
@@ -141,7 +143,7 @@ def _complain(command: str, what: str) -> None:
 
 
 def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: OptionsT | None = None) -> OptionsT:
-    """Options from the words of a command line.
+    """Options from the words of a command line; JAX's CPU backend is then set up, before what uses them starts it.
 
     Raises:
         ConfigError: for an option that does not exist or a value that does not fit, in one line.
@@ -157,12 +159,16 @@ def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: O
     try:
         with contextlib.redirect_stderr(said):
             if default is None:
-                return tyro.cli(kind, args=words, prog=f"segvisrl {command}")
-            return tyro.cli(kind, args=words, prog=f"segvisrl {command}", default=default)
+                asked = tyro.cli(kind, args=words, prog=f"segvisrl {command}")
+            else:
+                asked = tyro.cli(kind, args=words, prog=f"segvisrl {command}", default=default)
     except SystemExit as stop:
         if not stop.code:
             raise
         raise _config_error(stop) or ConfigError(_in_our_words(said.getvalue(), words)) from None
+    if command not in WITHOUT_JAX:
+        make_callbacks_safe()
+    return asked
 
 
 def _config_error(error: BaseException | None) -> ConfigError | None:

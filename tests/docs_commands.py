@@ -75,7 +75,8 @@ NOT_RUN = {  # what a command starts with, and why it is not run
 }
 NAMED_ALONE = 2  # words
 SLURM = {  # stands in for SLURM on one machine: starts two processes as srun would
-    "srun": 'export SLURM_JOB_NODELIST=here SLURM_NTASKS=2\nSLURM_PROCID=1 "$@" &\nSLURM_PROCID=0 "$@"\nwait',
+    "srun": "export SLURM_JOB_ID=1 SLURM_JOB_NODELIST=here SLURM_STEP_NODELIST=here SLURM_STEP_NUM_NODES=2\n"
+    'export SLURM_NTASKS=2 SLURM_LOCALID=0\nSLURM_PROCID=1 "$@" &\nSLURM_PROCID=0 "$@"\nwait',
     "scontrol": "echo 127.0.0.1",
 }
 

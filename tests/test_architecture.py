@@ -40,7 +40,7 @@ MAY_IMPORT = {  # part -> the parts it may import, besides itself
         "view",
         "cli",
     },
-    "cli": {"config", "commands", "machine"},
+    "cli": {"config", "commands", "cpu", "machine"},
     "__init__": {"config", "env", "vision", "training"},
 }
 ENV_DATA = {"env.model", "env.rocks", "env.scene", "env.pose"}

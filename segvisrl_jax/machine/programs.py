@@ -10,7 +10,10 @@ import platform
 from collections.abc import MutableMapping
 from pathlib import Path
 
-FOLDER_VARIABLE = "JAX_COMPILATION_CACHE_DIR"
+from segvisrl_jax.machine.programs_damage import remove_damaged_programs
+
+FOLDER_VARIABLE, SIZE_VARIABLE = "JAX_COMPILATION_CACHE_DIR", "JAX_COMPILATION_CACHE_MAX_SIZE"
+NO_LARGEST_SIZE = "-1"
 LARGEST_BYTES = 2**30  # beyond it what was used longest ago goes; one architecture takes some megabytes
 QUICK_SECONDS = 0.3  # what compiles faster is not worth a file
 
@@ -18,7 +21,8 @@ QUICK_SECONDS = 0.3  # what compiles faster is not worth a file
 def keep_compiled_programs(environment: MutableMapping[str, str] = os.environ) -> None:
     """Has JAX keep compiled programs in ``programs_folder``; variables that are set already stay.
 
-    Where the folder cannot be made or written to, nothing is kept. ``JAX_ENABLE_COMPILATION_CACHE=false`` turns it off.
+    Where the folder cannot be made or written to, nothing is kept. Entries that were cut short are removed, where the
+    folder has a largest size. ``JAX_ENABLE_COMPILATION_CACHE=false`` turns it off.
     """
     if FOLDER_VARIABLE not in environment:
         folder = programs_folder(environment)
@@ -29,8 +33,10 @@ def keep_compiled_programs(environment: MutableMapping[str, str] = os.environ) -
         if not os.access(folder, os.W_OK | os.X_OK):
             return
         environment[FOLDER_VARIABLE] = str(folder)
-        environment.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(LARGEST_BYTES))
+        environment.setdefault(SIZE_VARIABLE, str(LARGEST_BYTES))
     environment.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(QUICK_SECONDS))
+    if environment.get(SIZE_VARIABLE, NO_LARGEST_SIZE) != NO_LARGEST_SIZE:
+        remove_damaged_programs(Path(environment[FOLDER_VARIABLE]))
 
 
 def programs_folder(environment: MutableMapping[str, str] = os.environ) -> Path:

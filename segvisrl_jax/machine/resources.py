@@ -6,12 +6,12 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from segvisrl_jax.cpu import num_cores
+from segvisrl_jax.cpu import CGROUP, usable_cores
 from segvisrl_jax.machine.finding import GIB, Finding
 from segvisrl_jax.machine.programs import programs_folder
 
 SECTION = "this machine"
-CGROUP, MEMINFO = Path("/sys/fs/cgroup"), Path("/proc/meminfo")
+MEMINFO = Path("/proc/meminfo")
 NO_LIMIT = 2**60  # bytes; control groups of version 1 say so many where there is no limit
 LEAST_MEMORY_GIB = 4.0  # training takes 1 to 3 GiB with the preset cpu, most of it while compiling
 LEAST_DISK_GIB = 1.0  # a run takes some 20 MB, and compiled kernels and videos come on top
@@ -21,26 +21,11 @@ BUSY_SHARE = 0.5  # of the cores: above it, what is measured here is not what th
 def look(runs_dir: Path, cgroup: Path = CGROUP) -> Iterator[Finding]:
     """Cores, load, memory, and the disk that runs are written to."""
     usable = usable_cores(cgroup)
-    yield _cores(os.cpu_count() or 1, num_cores(), usable)
+    yield _cores(os.cpu_count() or 1, usable)
     yield from _load(usable)
     yield _memory(free_memory_bytes(cgroup))
     yield _disk(runs_dir)
     yield _programs(programs_folder())
-
-
-def usable_cores(cgroup: Path = CGROUP) -> float:
-    """Cores that the scheduler and a container's quota leave to this process; may be a fraction."""
-    return min(num_cores(), _quota(cgroup) or num_cores())
-
-
-def _quota(cgroup: Path) -> float | None:
-    """Cores of a container's quota, in either version of Linux's control groups; None where there is none."""
-    words = (_read(cgroup / "cpu.max") or "").split()
-    if not words:
-        words = [_read(cgroup / "cpu" / f"cpu.cfs_{name}_us") or "" for name in ("quota", "period")]
-    if len(words) != 2 or not all(word.isdigit() for word in words):  # "max" and -1 stand for no quota
-        return None
-    return int(words[0]) / int(words[1])
 
 
 def free_memory_bytes(cgroup: Path = CGROUP, meminfo: Path = MEMINFO) -> int | None:
@@ -102,13 +87,10 @@ def _read(path: Path) -> str | None:
         return None
 
 
-def _cores(present: int, allowed: int, usable: float) -> Finding:
-    """``allowed``: those on which the scheduler lets this process run; a container's quota may leave it less time."""
+def _cores(present: int, usable: float) -> Finding:
+    """What the scheduler and a container's quota leave: there are that many threads, rounded up (``cpu.num_cores``)."""
     text = str(present) if usable >= present else f"{present}, of which this process may use {usable:g}"
-    if usable >= allowed:
-        return Finding(SECTION, "cores", text)
-    remedy = f"Physics takes a thread for each of {allowed} cores: add --env.physics.num-threads {max(1, int(usable))}."
-    return Finding(SECTION, "cores", text, "note", remedy)
+    return Finding(SECTION, "cores", text)
 
 
 def _load(usable: float) -> Iterator[Finding]:

@@ -19,6 +19,7 @@ from segvisrl_jax.agent.networks import Network, Params, make_network
 from segvisrl_jax.agent.ppo import Learner, LearnerState, make_learner
 from segvisrl_jax.agent.shard import Shard
 from segvisrl_jax.config import ConditionsConfig, EnvConfig, TrainConfig, replace_fields, require
+from segvisrl_jax.cpu import make_callbacks_safe
 from segvisrl_jax.env.rover_env import RoverEnv, observation_shape
 from segvisrl_jax.env.wrappers import VALIDATION_STREAM, BatchEnv, scene_stream
 from segvisrl_jax.training.checkpoint import load_policy
@@ -183,6 +184,7 @@ def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | N
         DivergedError: where a loss or gradient was not finite in each of ``max_bad_updates`` updates in a row.
     """
     say = functools.partial(_tell, say)
+    make_callbacks_safe()  # before anything starts JAX's backends
     processes = join(config)
     processes.together(lambda: require_installed(config.loggers))
     first_params = None if config.resume else processes.together(lambda: _params_to_start_from(config))

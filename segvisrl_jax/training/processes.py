@@ -88,6 +88,7 @@ def join(config: TrainConfig) -> Processes:
                 config.coordinator,
                 config.num_processes,
                 config.process_id,
+                cluster_detection_method="deactivate",  # all is said; under SLURM it would leave each process one GPU
                 initialization_timeout=JOIN_S,
                 heartbeat_timeout_seconds=HEARTBEAT_S,
             )

@@ -9,10 +9,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from segvisrl_jax.config import preset_config
+from segvisrl_jax import cpu
+from segvisrl_jax.config import EnvConfig, preset_config
+from segvisrl_jax.env.physics import native
 from segvisrl_jax.machine import devices, installed, probe, resources
 from segvisrl_jax.machine.finding import GIB, Finding
 from segvisrl_jax.machine.reading import Reading, in_words, training_time_s
+from segvisrl_jax.training.cores import acting_cores
 
 
 def by_name(findings):
@@ -83,21 +86,30 @@ def cgroup(folder, **files):
 
 def test_a_containers_share_of_the_cores_counts(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(8)), raising=False)
-    assert resources.usable_cores(tmp_path) == 8
-    assert resources.usable_cores(cgroup(tmp_path, cpu_max="max 100000\n")) == 8
-    assert resources.usable_cores(cgroup(tmp_path, cpu_max="150000 100000\n")) == 1.5
+    assert cpu.usable_cores(tmp_path) == cpu.num_cores(tmp_path) == 8
+    assert cpu.num_cores(cgroup(tmp_path, cpu_max="max 100000\n")) == 8
+    assert cpu.num_cores(cgroup(tmp_path, cpu_max="20000 100000\n")) == 1
+    assert cpu.usable_cores(cgroup(tmp_path, cpu_max="150000 100000\n")) == 1.5
+    assert cpu.num_cores(tmp_path) == 2
     old = tmp_path / "old"
     (old / "cpu").mkdir(parents=True)
     (old / "cpu" / "cpu.cfs_quota_us").write_text("200000")
     (old / "cpu" / "cpu.cfs_period_us").write_text("100000")
-    assert resources.usable_cores(old) == 2
+    assert cpu.usable_cores(old) == cpu.num_cores(old) == 2
     (old / "cpu" / "cpu.cfs_quota_us").write_text("-1")
-    assert resources.usable_cores(old) == 8
-    cores = resources._cores(8, 8, 1.5)
-    assert cores.mark == "note"
-    assert "--env.physics.num-threads 1" in cores.remedy
-    few = resources._cores(8, 2, 2)  # two of eight: physics takes two threads by itself
-    assert (few.value, few.mark) == ("8, of which this process may use 2", "ok")
+    assert cpu.usable_cores(old) == cpu.num_cores(old) == 8
+    few = resources._cores(8, 1.5)
+    assert (few.value, few.mark) == ("8, of which this process may use 1.5", "ok")
+
+
+def test_every_pool_of_threads_fits_a_containers_share(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(8)), raising=False)
+    monkeypatch.setattr(cpu, "_quota", lambda cgroup: 1.5)
+    assert acting_cores(32) == 2
+    started = []
+    monkeypatch.setattr(native, "_shared_mover", lambda *given: started.append(given[-1]) or ("", None))
+    native.NativeEngine(EnvConfig())
+    assert started == [2]
 
 
 def test_a_containers_limit_of_memory_counts(tmp_path):

@@ -140,6 +140,31 @@ def test_where_one_cannot_begin_none_does(tmp_path):
     assert not (folder / "run").exists()
 
 
+JOIN = """
+import sys, jax
+from segvisrl_jax.config import TrainConfig
+from segvisrl_jax.training.processes import join
+processes = join(TrainConfig(num_processes=2, process_id=int(sys.argv[1]), coordinator=sys.argv[2]))
+print(jax.config.values["jax_cuda_visible_devices"])
+processes.leave()
+"""
+SLURM = {"JOB_ID": "1", "STEP_NODELIST": "here", "NTASKS": "2", "LOCALID": "0", "STEP_NUM_NODES": "2"}
+
+
+def test_under_slurm_a_process_sees_all_gpus_of_its_node():
+    given, where = {f"SLURM_{name}": value for name, value in SLURM.items()}, f"127.0.0.1:{free_port()}"
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", JOIN, str(i), where],
+            env=os.environ | given | {"SLURM_PROCID": str(i)},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for i in range(COUNT)
+    ]
+    assert [process.communicate(timeout=START_S)[0] for process in processes] == ["all\n", "all\n"]
+
+
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
