@@ -176,7 +176,7 @@ def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | N
 
     Writes config.json, metrics.jsonl, TensorBoard events, checkpoints/ and policy/ (the best one) to the run folder.
     Where it is one of several processes, it meets the others first, and ends with all of them; where one is lost,
-    this process ends at once (exit code 3).
+    this process ends at once (exit code 3), and within ``processes.ALIKE_S`` where it alone fails (exit code 1).
 
     Raises:
         ConfigError: where the run folder exists and is not to be resumed, or cannot be; where the policy to start from
@@ -189,24 +189,17 @@ def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | N
     processes.together(lambda: require_installed(config.loggers))
     first_params = None if config.resume else processes.together(lambda: _params_to_start_from(config))
     processes.on_first(lambda: open_run_dirs(config))
-    with contextlib.ExitStack() as stack:
+    go_on = f"{Path(config.runs_dir) / config.runs[0].run_name} has its last checkpoint: start all again with --resume"
+    with contextlib.ExitStack() as stack, processes.giving_up(go_on):
+        stack.callback(processes.leave)
         runs = open_runs(config, processes, say if processes.is_first else _say_nothing)
         for run in runs:
             stack.callback(run.close)
-        try:
-            session = _Session(config, runs, processes)
-            late = functools.partial(session.end_late, when_late) if when_late and processes.count == 1 else None
-            with StopSignals(late=late) as stop:
-                finished = session.drive(stop, first_params)
-            missing = tuple(
-                f"{run.folder}: {what}" for run in runs for what in run.not_on_disk(session.num_to_be_saved)
-            )
-        except jax.errors.JaxRuntimeError as error:
-            if processes.count > 1:  # at once: closing would wait for those who are gone
-                where = f"{runs[0].folder} has its last checkpoint"
-                processes.give_up(error, f"{where}: start all processes again with --resume")
-            raise
-    processes.leave()
+        session = _Session(config, runs, processes)
+        late = functools.partial(session.end_late, when_late) if when_late and processes.count == 1 else None
+        with StopSignals(late=late) as stop:
+            finished = session.drive(stop, first_params)
+        missing = tuple(f"{run.folder}: {what}" for run in runs for what in run.not_on_disk(session.num_to_be_saved))
     decisions = (runs[0].num_saved or 0) * config.ppo.decisions_per_update
     return TrainResult(tuple(run.folder for run in runs), finished, missing, decisions)
 

@@ -27,13 +27,12 @@ def free_port():
         return probe.getsockname()[1]
 
 
-def start(folder, words, count=COUNT, of_last=""):
+def start(folder, words, count=COUNT, of_last="", program=("-m", "segvisrl_jax.cli")):
     """``segvisrl train`` in ``count`` processes, their output in ``folder``/0, /1, ..."""
     folder.mkdir(exist_ok=True)
     common = [
         sys.executable,
-        "-m",
-        "segvisrl_jax.cli",
+        *program,
         "train",
         *TINY.split(),
         "--runs-dir",
@@ -138,6 +137,51 @@ def test_where_one_cannot_begin_none_does(tmp_path):
     assert "another process of the run refused" in said[0]
     assert "nowhere" in said[1]
     assert not (folder / "run").exists()
+
+
+FAIL_AFTER = 3  # updates
+FAIL = f"""
+import sys
+from segvisrl_jax import cli
+from segvisrl_jax.config import ConfigError
+from segvisrl_jax.training import loop
+%s
+update = loop._Session._update
+
+def update_or_fail(session, state):
+    if session._updates == {FAIL_AFTER} and session.config.process_id in failing:
+        raise error
+    return update(session, state)
+
+loop._Session._update = update_or_fail
+sys.exit(cli.main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("error", "failing"),
+    [("OSError(28, 'No space left on device')", 0), ("KeyboardInterrupt", 1)],
+)
+def test_one_fails_by_itself_and_the_other_ends(error, failing, tmp_path):
+    folder = tmp_path / "runs"
+    code = f"error, failing = {error}, [{failing}]\n"
+    processes = start(folder, "--steps 1e6 --checkpoint-every-updates 1", program=("-c", FAIL % code))
+    wait_for_rows(folder, processes, FAIL_AFTER)
+    codes, said = wait(folder, processes, END_S)
+    assert codes[failing] == 1, said
+    assert "this process of the run failed, no other did" in said[failing]
+    assert codes[1 - failing] in (3, -signal.SIGABRT), said
+    assert "another" in said[1 - failing]
+
+
+@pytest.mark.slow
+def test_all_fail_alike_and_end_in_order(tmp_path):
+    folder = tmp_path / "runs"
+    code = "error, failing = ConfigError('not here'), [0, 1]\n"
+    codes, said = wait(folder, start(folder, "--steps 1e6", program=("-c", FAIL % code)))
+    assert codes == [2, 2], said
+    assert all("segvisrl train: not here" in each for each in said)
 
 
 JOIN = """
