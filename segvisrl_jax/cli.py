@@ -10,9 +10,11 @@ import importlib
 import io
 import os
 import re
+import signal
 import sys
+import threading
 import typing
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -88,7 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         keep_compiled_programs()
     try:
         module = importlib.import_module(f"segvisrl_jax.commands.{command}")
-        with one_line_where_memory_ends(what_there_is(SMALLER.get(command, ""))):
+        with _ending_at_once(command), one_line_where_memory_ends(what_there_is(SMALLER.get(command, ""))):
             code = module.run(options)
         sys.stdout.flush()
         return code
@@ -106,6 +108,31 @@ def main(argv: Sequence[str] | None = None) -> int:
         return READER_GONE
     except OSError as error:
         return _end_of(command, error)
+
+
+@contextlib.contextmanager
+def _ending_at_once(command: str) -> Iterator[None]:
+    """Has Ctrl-C end a training at once, until it has its own way to stop, and after that.
+
+    While libraries start, Python's KeyboardInterrupt may come up inside a callback that drops it, or in C++, which
+    aborts. What a run has on disk is whole at any moment.
+    """
+    is_python_s = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if command != "train" or not is_python_s or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(number: int, frame: object) -> None:
+        with contextlib.suppress(Exception):
+            sys.stdout.flush()
+        os.write(2, f"\nsegvisrl {command}: interrupted\n".encode())
+        os._exit(INTERRUPTED)
+
+    signal.signal(signal.SIGINT, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _end_of(command: str, error: OSError) -> int:

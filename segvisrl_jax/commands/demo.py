@@ -1,6 +1,7 @@
 """``segvisrl demo``: a policy drives one scene, and a video shows what it saw and where it went."""
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -43,13 +44,17 @@ def run(options: Sequence[str]) -> int:
     """Parses, drives, writes."""
     asked = parse(DemoOptions, options, "demo")
     require_file_can_be_written(asked.video, "--output")
-    outcome = record(asked)
+    outcome = record(asked, functools.partial(print, flush=True))
     print(f"{outcome}: {asked.video}")
     return 0
 
 
-def record(asked: DemoOptions) -> str:
-    """Drives the scene and writes the video. Returns how the episode ended, and when."""
+def _say_nothing(line: str) -> None:
+    """For those who make a video among other things."""
+
+
+def record(asked: DemoOptions, say: Callable[[str], object] = _say_nothing) -> str:
+    """Drives the scene, writes the video, and says what it is at. Returns how the episode ended, and when."""
     from segvisrl_jax.commands.eval import load_driver, with_overrides
     from segvisrl_jax.env.rover_env import RoverEnv
     from segvisrl_jax.env.wrappers import TEST_STREAM, scene_stream
@@ -60,10 +65,10 @@ def record(asked: DemoOptions) -> str:
     policy_name = asked.policy if named else DEFAULT_POLICY
     policy, params, config = load_driver(asked.run, policy_name, asked.controller)
     env = RoverEnv(with_overrides(config, asked.num_rocks, None, None))
-    print(f"{policy.name} drives scene {asked.scene}; compiling takes half a minute the first time", flush=True)
+    say(f"{policy.name} drives scene {asked.scene}; compiling takes half a minute the first time")
     episode = drive_episode(env, policy, params, scene_stream(0, TEST_STREAM), asked.scene)
     seconds = f"{episode.num_decisions * env.dt:.0f} s"
-    print(f"{episode.outcome.name.lower()} after {seconds}; drawing {episode.num_decisions} frames", flush=True)
+    say(f"{episode.outcome.name.lower()} after {seconds}; drawing {episode.num_decisions} frames")
     write_video(asked.video, episode_frames(env, episode, title=policy.name), fps=FRAMES_PER_SECOND)
     return f"{episode.outcome.name.lower()} after {seconds}"
 

@@ -53,7 +53,7 @@ def run(options: Sequence[str]) -> int:
     going_on = f"Go on with:\n  {resume_command(config)}"
     try:
         with _told_where_memory_ends(config):
-            result = train(config, _say, when_late=lambda said: _end_now(f"{said} {going_on}"))
+            result = train(config, when_late=lambda said: _end_now(f"{said} {going_on}"))
     except DivergedError as error:
         print(f"segvisrl train: {error}", file=sys.stderr)
         return FAILURE
@@ -66,13 +66,6 @@ def run(options: Sequence[str]) -> int:
         print(f"Stopped and saved after {result.decisions:,} decisions. {going_on}")
         return INTERRUPTED
     return _leave_products(config, result.run_dirs)
-
-
-def _say(line: str) -> None:
-    from segvisrl_jax.training.metrics import going_on_where_output_fails
-
-    with going_on_where_output_fails():
-        print(line)
 
 
 def resume_command(config: TrainConfig) -> str:

@@ -259,23 +259,8 @@ class _PlainLines:
 
     def finish(self) -> None:
         if self._pending:
-            with going_on_where_output_fails():
-                self._console.print(self._pending, soft_wrap=True, markup=False, highlight=False)
+            self._console.print(self._pending, soft_wrap=True, markup=False, highlight=False)
             self._printed_at, self._pending = time.monotonic(), ""
-
-
-@contextlib.contextmanager
-def going_on_where_output_fails() -> Iterator[None]:
-    """What is told on the way is not worth a training: it goes on where its log is on a disk that is full.
-
-    A reader who has had enough ends it, as every program.
-    """
-    try:
-        yield
-    except BrokenPipeError:
-        raise
-    except OSError:
-        return
 
 
 def _clock(seconds: float) -> str:

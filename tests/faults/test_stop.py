@@ -217,3 +217,15 @@ def test_the_second_signal_does_not_wait():
         signal.raise_signal(signal.SIGINT)
         time.sleep(0.5)
     assert late == [True]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("after_s", [1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0])
+def test_ctrl_c_ends_a_training_whose_libraries_are_starting(after_s, tmp_path):
+    """Callbacks in C++ drop Python's KeyboardInterrupt, or abort."""
+    training = Training(tmp_path, *SHORT)
+    time.sleep(after_s)
+    seconds, code, said = training.stop(signal.SIGINT)
+    assert (code, seconds < ENDS_WITHIN_S) == (130, True), said
+    assert "Traceback" not in said
+    assert "ignored" not in said
