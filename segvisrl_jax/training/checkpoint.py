@@ -19,6 +19,7 @@ import orbax.checkpoint as ocp
 
 from segvisrl_jax.assets import asset_dir
 from segvisrl_jax.config import ConfigError, TrainConfig, from_dict, read_json, to_dict
+from segvisrl_jax.cpu import make_callbacks_safe
 from segvisrl_jax.training.manifest import (
     MANIFEST,
     library_versions,
@@ -257,6 +258,7 @@ def load_policy(folder: Path) -> tuple[TrainConfig, Any, dict[str, Any]]:
     Raises:
         ConfigError: where it is missing or damaged; the message names the file.
     """
+    make_callbacks_safe()  # for whoever builds an environment afterwards
     folder = _find_policy(Path(folder))
     card = folder / "policy.json"
     for tries_left in reversed(range(POLICY_TRIES)):

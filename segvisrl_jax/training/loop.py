@@ -168,7 +168,9 @@ class DivergedError(RuntimeError):
 
 
 def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | None = None) -> TrainResult:
-    """Runs one training, or one of every seed, to its end, or to the first SIGINT or SIGTERM, which saves and returns.
+    """Runs one training, or one of every seed, to its end, or to the first SIGINT, SIGTERM or SIGHUP.
+
+    A signal saves and returns.
 
     Where ``when_late`` is given and an update takes longer than ``stop_signals.GRACE_S`` after the signal, the state
     before that update is saved in its place, and ``when_late`` is called, in another thread, with a line that says what
