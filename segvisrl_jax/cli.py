@@ -192,7 +192,7 @@ def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: O
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise _config_error(stop) or ConfigError(_in_our_words(said.getvalue(), words)) from None
+        raise _config_error(stop) or ConfigError(_in_our_words(said.getvalue(), words, command)) from None
     if command not in WITHOUT_JAX:
         make_callbacks_safe()
     return asked
@@ -234,7 +234,7 @@ def _one_line(message: str) -> str:
     return " ".join(paragraph)
 
 
-def _in_our_words(message: str, words: Sequence[str]) -> str:
+def _in_our_words(message: str, words: Sequence[str], command: str) -> str:
     """tyro's complaint as all others are: the option, its value, what would be right; as it is where it is unknown."""
     complaint = _one_line(message)
     for pattern, should in COMPLAINTS.items():
@@ -251,7 +251,8 @@ def _in_our_words(message: str, words: Sequence[str]) -> str:
     before = words[words.index(first) - 1] if first in words[1:] else ""
     if before.startswith("--") and not first.startswith("-"):
         return f"{before} = {first!r}: should be left out; {before} takes no value"
-    meant = ELSEWHERE.get(first.removeprefix("--ppo.").removeprefix("--")) or _suggested(message)
+    name = first.partition("=")[0].removeprefix("--ppo.").removeprefix("--")
+    meant = (ELSEWHERE.get(name) if command == "train" else None) or _suggested(message)
     if meant and first.startswith("--"):
         return f"{unknown[1]}: should be {meant}, if that was meant; --help lists the options"
     return f"{unknown[1]}: should be left out; --help lists the options"

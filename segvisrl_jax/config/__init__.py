@@ -7,7 +7,14 @@ Nothing here depends on JAX or MuJoCo.
 from segvisrl_jax.config.checks import ConfigError, is_finite, is_plain_text, one_line, read_json, require
 from segvisrl_jax.config.conditions import ConditionsConfig
 from segvisrl_jax.config.environment import CameraConfig, EnvConfig, PhysicsConfig, SceneConfig, TaskConfig
-from segvisrl_jax.config.learning import BOOKKEEPING, EvaluationConfig, NetworkConfig, PPOConfig, TrainConfig
+from segvisrl_jax.config.learning import (
+    BOOKKEEPING,
+    RUN_TEST_SEED,
+    EvaluationConfig,
+    NetworkConfig,
+    PPOConfig,
+    TrainConfig,
+)
 from segvisrl_jax.config.names import (
     ARCH_OBSERVATION,
     IMAGE_OBSERVATIONS,
@@ -31,6 +38,7 @@ __all__ = [
     "ARCH_OBSERVATION",
     "BOOKKEEPING",
     "IMAGE_OBSERVATIONS",
+    "RUN_TEST_SEED",
     "Arch",
     "CameraConfig",
     "ConditionsConfig",

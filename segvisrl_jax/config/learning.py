@@ -145,6 +145,8 @@ class EvaluationConfig:
         require(self.rocks is None or self.rocks >= 0, f"{p}.rocks", self.rocks, "0 or more, or None")
 
 
+RUN_TEST_SEED = 1
+"""Of the test scenes at a run's end, whatever the run's seed: who compares settings by them leaves seed 0 unseen."""
 BOOKKEEPING = (
     "run", "runs_dir", "resume", "loggers", "checkpoint_every_updates", "max_bad_updates", "num_seeds", "num_devices",
     "coordinator", "num_processes", "process_id",

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from segvisrl_jax.config import ConfigError, is_finite, read_json, require
+from segvisrl_jax.config import RUN_TEST_SEED, ConfigError, is_finite, read_json, require
 from segvisrl_jax.sweep.plan import Trial
 from segvisrl_jax.training.metrics_rows import read_rows
 from segvisrl_jax.training.output import write_output
@@ -34,6 +34,7 @@ def _scores(run_dir: Path) -> dict[str, float]:
     file = run_dir / "eval.json"
     try:
         result = read_json(file)
+        require(result["seed"] == RUN_TEST_SEED, "seed of the test scenes", result["seed"], f"{RUN_TEST_SEED}")
         low, high = result["success_ci95"]
         last = read_rows(run_dir)[-1]
         speed = last["step"] / last["time/seconds"]

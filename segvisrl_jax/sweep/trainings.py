@@ -5,7 +5,7 @@ import threading
 from collections.abc import Sequence
 from typing import Any
 
-from segvisrl_jax.training.stop_signals import handlers_for, leave_closed_terminal
+from segvisrl_jax.training.stop_signals import HANGUP, handlers_for, leave_closed_terminal
 
 GRACE_S = 15.0  # a training that is told to stop has saved itself after five to ten
 
@@ -59,7 +59,8 @@ class Trainings:
 
     def _hear(self, number: int, frame: object) -> None:
         leave_closed_terminal()
-        self.stop()
+        if number not in HANGUP or not self.is_stopping:  # of a closed terminal, shell and system tell
+            self.stop()
 
     def _kill(self) -> None:
         with self._lock:

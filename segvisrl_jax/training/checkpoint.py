@@ -36,6 +36,7 @@ CHECKPOINTS_KEPT = 2
 POLICY_TRIES = 5  # to read a policy that is being replaced by a better one
 POLICY_FORMAT = FIRST_WITH_CHECKSUMS = 2  # before: the parameters in params.npz
 SETTINGS_FILE = "config.json"  # of the run
+MARK = "has_checkpoints"
 DAMAGED_FOLDER = "damaged"  # where checkpoints go that cannot be read
 UNFINISHED, FOREIGN = "was not finished", "was made with other settings than the run has"
 
@@ -79,10 +80,21 @@ class Checkpoints:
             if self._processes.is_first:
                 about = {"updates": updates, "settings": self._settings(), "versions": library_versions()}
                 write_manifest(self._folder / str(updates), about)
+                self._mark()
         except Exception:
             if self._processes.count == 1:
                 self._start_again(updates)
             raise
+
+    @property
+    def are_lost(self) -> bool:
+        """Whether there is none any more."""
+        return self.latest is None and (self._run_dir / MARK).exists()
+
+    def _mark(self) -> None:
+        mark = self._run_dir / MARK
+        if not mark.exists():
+            mark.write_text("The run has checkpoints: without any, it does not begin again.\n")
 
     def _start_again(self, updates: int) -> None:
         """Drops what a failed write left, and the manager, which counts it as written."""

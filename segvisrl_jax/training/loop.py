@@ -18,7 +18,7 @@ from rich.console import Console
 from segvisrl_jax.agent.networks import Network, Params, make_network
 from segvisrl_jax.agent.ppo import Learner, LearnerState, make_learner
 from segvisrl_jax.agent.shard import Shard
-from segvisrl_jax.config import ConditionsConfig, EnvConfig, TrainConfig, replace_fields, require
+from segvisrl_jax.config import ConditionsConfig, ConfigError, EnvConfig, TrainConfig, replace_fields, require
 from segvisrl_jax.cpu import make_callbacks_safe
 from segvisrl_jax.env.rover_env import RoverEnv, observation_shape
 from segvisrl_jax.env.wrappers import VALIDATION_STREAM, BatchEnv, scene_stream
@@ -292,7 +292,8 @@ class _Session:
             if self._whole is not None and not at_once and not self._bad_updates:
                 state, hosts = self._whole
                 for i, (run, host) in enumerate(zip(self.runs, hosts, strict=True)):
-                    run.save(self.trainer.of_seed(state, i), host)
+                    with contextlib.suppress(ConfigError):  # the folder is another run's now
+                        run.save(self.trainer.of_seed(state, i), host)
             saved = self.runs[0].num_saved
             decisions = (saved or 0) * self.config.ppo.decisions_per_update
             end(f"Stopped at once; saved are {decisions:,} decisions." if saved else "Stopped before the first save.")

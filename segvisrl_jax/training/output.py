@@ -14,7 +14,7 @@ def write_output(path: Path, content: str | bytes) -> None:
     """
     data = content.encode() if isinstance(content, str) else content
     try:
-        if path.exists() and not path.is_file():
+        if path.exists() and (not path.is_file() or path.is_relative_to("/dev")):
             path.write_bytes(data)
         else:
             replace_file(path.resolve(), lambda file: file.write(data))

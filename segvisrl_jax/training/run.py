@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import json
 import shutil
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,6 @@ from segvisrl_jax.config import BOOKKEEPING, ConfigError, TrainConfig, flatten, 
 from segvisrl_jax.training.checkpoint import Checkpoints, load_policy, save_policy
 from segvisrl_jax.training.manifest import replace_file
 from segvisrl_jax.training.metrics import MetricsWriter
-from segvisrl_jax.training.metrics_rows import read_rows
 from segvisrl_jax.training.processes import Processes
 from segvisrl_jax.training.rollout import EpisodeLog
 from segvisrl_jax.training.run_lock import RunLock, is_being_trained
@@ -29,6 +29,7 @@ RECENT_EPISODES = 200  # what the progress bar's shares are taken over
 # Not evaluation.rocks and evaluation.episodes: the best policy so far was judged by them.
 FREE_ON_RESUME = (*BOOKKEEPING, "steps", "preset", "evaluation.every_decisions", "evaluation.num_slots")
 OUTCOMES = (Outcome.SUCCESS, Outcome.COLLISION, Outcome.FALL, Outcome.TIMEOUT, Outcome.UNSTABLE)
+PATIENCE_S = 3.0  # with another thread that writes the policy
 OURS = ("lock",)  # what may be in a folder that no run has begun in, besides half-written files
 
 
@@ -64,6 +65,7 @@ class Run:
         self._lock: RunLock | None = None
         self._policy: tuple[Params, dict[str, Any]] | None = None  # the best, with its scores
         self._policy_is_waiting = False
+        self._writing_policy = threading.Lock()
         self._best_on_disk: list[float] = []  # rank of the policy there
         self._failing: set[str] = set()
         with contextlib.ExitStack() as stack:
@@ -101,14 +103,12 @@ class Run:
         """Where there is no checkpoint: checks that there never was one.
 
         Raises:
-            ConfigError: where the run has numbers of updates that lie behind a checkpoint.
+            ConfigError: where there was.
         """
-        reached = max((int(row["step"]) for row in read_rows(self.folder)), default=0)
-        updates = reached // self.config.ppo.decisions_per_update
-        if updates > self.config.checkpoint_every_updates:
+        if self._checkpoints.are_lost:
             raise ConfigError(
-                f"run = {str(self.folder)!r}: has numbers of {updates} updates and no checkpoint any more; "
-                "put its checkpoints/ back, or start again under another --run"
+                f"run = {str(self.folder)!r}: had checkpoints, and has none now; put its checkpoints/ back, or start "
+                "again under another --run"
             )
 
     def _find_policy(self) -> None:
@@ -188,18 +188,43 @@ class Run:
         return missing + ([f"{lines} lines of metrics.jsonl"] if lines else [])
 
     def _write_policy(self) -> None:
-        if self._policy is None or not self._policy_is_waiting:
+        if not self._writing_policy.acquire(timeout=PATIENCE_S):  # the thread that ends a late run may come here too
             return
-        params, scores = self._policy
-        write = functools.partial(save_policy, self.folder / "policy", self.config, params, scores)
-        if self._try("the best policy", write):
-            self._policy_is_waiting, self._best_on_disk = False, _rank(scores)
+        try:
+            if self._policy is None or not self._policy_is_waiting:
+                return
+            params, scores = self._policy
+            write = functools.partial(save_policy, self.folder / "policy", self.config, params, scores)
+            if self._try("the best policy", write):
+                self._policy_is_waiting, self._best_on_disk = False, _rank(scores)
+        finally:
+            self._writing_policy.release()
 
     def _require_ours(self) -> None:
-        """Nothing is written into another run's folder; where it cannot be looked at, writing says why."""
-        if self._lock is not None:
-            with contextlib.suppress(OSError):
-                self._lock.require_ours()
+        """Nothing is written into another run's folder; where it cannot be looked at, writing says why.
+
+        Raises:
+            ConfigError: where the folder was removed, and another run stands in its place.
+        """
+        if self._lock is None:
+            return
+        with contextlib.suppress(OSError):
+            if not self._lock.is_same() and not self._holds_our_settings():
+                raise ConfigError(
+                    f"run = {str(self.folder)!r}: was removed while it trained, and another run stands there now; "
+                    "nothing more is written"
+                )
+
+    def _holds_our_settings(self) -> bool:
+        """Whether the folder is that of this run, moved or restored, or an empty one."""
+        file = self.folder / "config.json"
+        if not file.exists():
+            return True
+        try:
+            _require_same_run(self.config, flatten(to_dict(TrainConfig())) | flatten(read_json(file)), self.folder)
+        except (ValueError, TypeError, AttributeError):
+            return False
+        return True
 
     def _put_back(self) -> None:
         """Writes the settings and the best policy again where somebody removed the run's folder."""

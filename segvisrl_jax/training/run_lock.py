@@ -23,26 +23,22 @@ class RunLock:
         self._run_dir = Path(run_dir)
         self._file = _locked_file(self._run_dir)
 
-    def require_ours(self) -> None:
-        """Checks that the folder is still the one that was locked; takes it anew where somebody removed it.
+    def is_same(self) -> bool:
+        """Whether the folder is still the one that was locked, or was removed; else it has been locked anew.
 
         Raises:
-            ConfigError: where it was removed, and another run stands in its place.
+            ConfigError: where another process holds the folder that is there now.
             OSError: where it cannot be made again, or looked at.
         """
         path = self._run_dir / LOCK_FILE
-        try:
+        with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(path.stat(), os.fstat(self._file.fileno())):
-                return
-        except FileNotFoundError:
-            self._run_dir.mkdir(parents=True, exist_ok=True)
-            file, self._file = self._file, _locked_file(self._run_dir)
-            file.close()
-            return
-        raise ConfigError(
-            f"run = {str(self._run_dir)!r}: was removed while it trained, and another run stands there now; "
-            "nothing more is written"
-        )
+                return True
+        is_gone = not self._run_dir.exists()
+        self._run_dir.mkdir(parents=True, exist_ok=True)
+        file, self._file = self._file, _locked_file(self._run_dir)
+        file.close()
+        return is_gone
 
     def close(self) -> None:
         """Lets go of the folder; a second call does nothing."""

@@ -13,12 +13,12 @@ from typing import Any
 
 GRACE_S = 5.0  # clouds give 30 s or more before they take a machine away, container runtimes 10
 
+HANGUP = (signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()  # Windows has none
+
 
 def stop_signals() -> tuple[int, ...]:
     """SIGINT, SIGTERM, and SIGHUP (the terminal was closed) unless it is ignored, as ``nohup`` has it."""
-    if not hasattr(signal, "SIGHUP") or signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:  # Windows has none
-        return signal.SIGINT, signal.SIGTERM
-    return signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    return signal.SIGINT, signal.SIGTERM, *(n for n in HANGUP if signal.getsignal(n) != signal.SIG_IGN)
 
 
 @contextlib.contextmanager
@@ -44,6 +44,8 @@ def leave_closed_terminal() -> None:
 
 class StopSignals:
     """While open, the first SIGINT, SIGTERM or SIGHUP asks to stop after the current update; a second one ends at once.
+
+    SIGHUP is never the second: of a terminal that is closed, both its shell and the system tell.
 
     An update or a compilation may take longer than a machine that is being taken away grants, and Python's own handlers
     wait until a compiled program returns; so a thread watches.
@@ -82,7 +84,7 @@ class StopSignals:
 
     def _request(self, number: int, frame: object) -> None:
         leave_closed_terminal()
-        if self.requested and self._late is None:
+        if self.requested and self._late is None and number not in HANGUP:
             raise KeyboardInterrupt
         self.requested = True
 
@@ -107,10 +109,9 @@ class StopSignals:
             numbers = told.recv(64)
             if not numbers:  # closed: nothing to watch any more
                 return None
-            asked = sum(number in self._numbers for number in numbers)
-            if asked:
+            for number in (number for number in numbers if number in self._numbers):
                 leave_closed_terminal()
-            if asked > 1 or (asked and deadline is not None):
-                return self._late(True)
-            if asked:
-                deadline = time.monotonic() + self._grace_s
+                if deadline is None:
+                    deadline = time.monotonic() + self._grace_s
+                elif number not in HANGUP:
+                    return self._late(True)

@@ -62,11 +62,16 @@ def finish(folder, trial, environment, start=None):
     """Stands for a training: leaves what a finished run has of it."""
     (folder / trial.name).mkdir(exist_ok=True)
     (folder / trial.name / "metrics.jsonl").write_text('{"step": 128, "time/seconds": 2.0}\n')
-    (folder / trial.name / "eval.json").write_text('{"success": 0.5, "success_ci95": [0.1, 0.9]}')
+    (folder / trial.name / "eval.json").write_text('{"success": 0.5, "success_ci95": [0.1, 0.9], "seed": 1}')
     return 0
 
 
-@pytest.mark.parametrize("damaged", ["", "{", "[]", '{"success": 0.5}', '{"success": null, "success_ci95": [0, 1]}'])
+OF_OTHER_SCENES = '{"success": 0.5, "success_ci95": [0.1, 0.9], "seed": 0}'
+
+
+@pytest.mark.parametrize(
+    "damaged", ["", "{", "[]", '{"success": 0.5}', '{"success": null, "success_ci95": [0, 1]}', OF_OTHER_SCENES]
+)
 def test_an_evaluation_that_cannot_be_read_is_made_again(damaged, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     [first, _] = trials = plan_trials([parse_axis("seed=0,1")], [])

@@ -32,7 +32,7 @@ from old_policy import copy_in_first_format
 from segvisrl_jax.commands import runs as runs_command
 from segvisrl_jax.commands.table import read_evaluation, sections_of
 from segvisrl_jax.commands.train import _stored_config
-from segvisrl_jax.config import ConfigError, EnvConfig, TrainConfig, from_dict, preset_config, to_dict
+from segvisrl_jax.config import RUN_TEST_SEED, ConfigError, EnvConfig, TrainConfig, from_dict, preset_config, to_dict
 from segvisrl_jax.report.figures import _read_run, _run_title
 from segvisrl_jax.report.learning_curves import band_of, methods_of, read_curves
 from segvisrl_jax.report.run_list import list_runs
@@ -294,7 +294,7 @@ LOADERS: dict[str, tuple[Load, st.SearchStrategy[Any]]] = {
     "learning curves: metrics.jsonl": (curves_of_metrics, line_files(ROWS)),
     "learning curves: config.json": (curves_of_settings, json_files(SETTINGS)),
     "learning curves: .csv": (curves_of_csv, damaged_bytes(CURVES) | st.binary(max_size=60)),
-    "sweep: eval.json": (sweeps_result, json_files(evaluation())),
+    "sweep: eval.json": (sweeps_result, json_files(evaluation() | {"seed": RUN_TEST_SEED})),
     "sweep: metrics.jsonl": (sweeps_metrics, line_files(ROWS)),
 }
 

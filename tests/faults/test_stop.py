@@ -170,6 +170,24 @@ def test_a_terminal_that_is_closed_ends_a_training_in_order(tmp_path):
     assert b"\x1b[" in b"".join(training.screen)  # it did show its progress there
 
 
+def test_a_second_hangup_ends_nothing_at_once():
+    """Of a terminal that is closed, its shell and the system tell."""
+    before, ended = signal.getsignal(signal.SIGHUP), []
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        with StopSignals(grace_s=600.0, late=ended.append) as stop:
+            for _ in range(3):
+                signal.raise_signal(signal.SIGHUP)
+            time.sleep(0.2)
+            assert (stop.requested, ended) == (True, [])
+        with StopSignals() as stop:
+            for _ in range(2):
+                signal.raise_signal(signal.SIGHUP)
+        assert stop.requested
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
 def test_a_hangup_stops_a_run_unless_it_is_ignored(monkeypatch):
     before = signal.getsignal(signal.SIGHUP)
     try:

@@ -50,40 +50,69 @@ def test_who_only_looks_is_waited_for(tmp_path):
         done.join()
 
 
-def test_a_folder_that_was_removed_is_taken_again_and_another_runs_is_not(tmp_path):
+def test_a_folder_that_was_removed_is_taken_again(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     lock = RunLock(folder)
-    lock.require_ours()
+    assert lock.is_same()
     shutil.rmtree(folder)
-    lock.require_ours()
+    assert lock.is_same()
     assert is_being_trained(folder)
     shutil.rmtree(folder)
     folder.mkdir()
-    RunLock(folder).close()
-    with pytest.raises(ConfigError, match="another run stands there now"):
-        lock.require_ours()
-    lock.close()
+    assert not lock.is_same()
+    shutil.rmtree(folder)
+    folder.mkdir()
+    other = RunLock(folder)
+    with pytest.raises(ConfigError, match="another process is training it"):
+        lock.is_same()
+    for held in (lock, other):
+        held.close()
+
+
+def small(tmp_path, **more):
+    few = {"num_envs": 4, "unroll_length": 8, "num_minibatches": 2, "mlp_sizes": (8, 8), "steps": 256}
+    return replace_fields(preset_config("mlp", "smoke"), runs_dir=str(tmp_path), run="run", **few | more)
+
+
+@pytest.fixture
+def at_the_third(monkeypatch):
+    """Has something happen before the third update."""
+    update, happens = loop._Session._update, []
+
+    def update_and(session, state):
+        if session._updates == 2 and happens:
+            happens.pop()()
+        return update(session, state)
+
+    monkeypatch.setattr(loop._Session, "_update", update_and)
+    return happens
 
 
 @pytest.mark.slow
-def test_a_run_writes_nothing_into_the_folder_of_another(tmp_path, monkeypatch):
-    small = {"num_envs": 4, "unroll_length": 8, "num_minibatches": 2, "mlp_sizes": (8, 8), "steps": 256}
-    config = replace_fields(preset_config("mlp", "smoke"), runs_dir=str(tmp_path), run="run", **small)
-    update, files = loop._Session._update, []
+def test_a_run_writes_nothing_into_the_folder_of_another(tmp_path, at_the_third):
+    def replace():
+        shutil.rmtree(tmp_path / "run")
+        loop.open_run_dirs(small(tmp_path, seed=5))
+        RunLock(tmp_path / "run").close()
 
-    def replaced_at_the_third(session, state):
-        if session._updates == 2 and not files:
-            shutil.rmtree(tmp_path / "run")
-            (tmp_path / "run").mkdir()
-            RunLock(tmp_path / "run").close()
-            files.extend((tmp_path / "run").rglob("*"))
-        return update(session, state)
-
-    monkeypatch.setattr(loop._Session, "_update", replaced_at_the_third)
+    at_the_third.append(replace)
     with pytest.raises(ConfigError, match="another run stands there now"):
-        loop.train(config, say=lambda line: None)
-    assert list((tmp_path / "run").rglob("*")) == files
+        loop.train(small(tmp_path), say=lambda line: None)
+    assert {path.name for path in (tmp_path / "run").rglob("*")} == {"config.json", "lock"}
+    assert '"seed": 5' in (tmp_path / "run" / "config.json").read_text()
+
+
+@pytest.mark.slow
+def test_a_run_whose_folder_was_copied_away_and_back_goes_on(tmp_path, at_the_third):
+    def move():
+        shutil.copytree(tmp_path / "run", tmp_path / "copy")
+        shutil.rmtree(tmp_path / "run")
+        shutil.copytree(tmp_path / "copy", tmp_path / "run")
+
+    at_the_third.append(move)
+    result = loop.train(small(tmp_path), say=lambda line: None)
+    assert (result.finished, result.not_on_disk) == (True, ())
 
 
 def test_a_folder_without_a_run_is_not_being_trained(tmp_path):
