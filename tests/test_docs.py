@@ -177,7 +177,7 @@ def _accepts(command: str, words: list[str]) -> bool:
     try:
         parse_segvisrl([command, *needed.get(command, []), *words])
     except ConfigError as error:
-        return "should be left out; --help" not in str(error)  # else its value is missing, or depends on another option
+        return "; --help lists the options" not in str(error)  # else its value is missing, or depends on another option
     return True
 
 

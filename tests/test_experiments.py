@@ -189,7 +189,7 @@ MISTAKES = (
     ("failures.py", ("--most", "0"), "--most = 0: should be in [1, 24]"),
     ("learning_curves.py", ("policy",), "should be a run's folder"),
     ("trajectories.py", ("p", "--episodes", "0"), "--episodes = 0: should be in [1, 10000]"),
-    ("trajectories.py", ("p", "--rocks", "0"), "--rocks, 0: should be left out"),
+    ("trajectories.py", ("p", "--rocks", "0"), "--rocks, 0: should be --num-rocks"),
     ("visual_gap.py", ("p", "--kinds", "fog"), "--kinds = 'fog': should be one of sun-elevation-deg, "),
 )
 
