@@ -263,13 +263,17 @@ def _finish(config: TrainConfig, run_dir: Path) -> list[str]:
 def _test(config: TrainConfig, run_dir: Path) -> None:
     """Drives test scenes with a finished run, says how well, and writes it down."""
     from segvisrl_jax.commands.eval import EvalOptions, as_json, evaluate, report_line
+    from segvisrl_jax.training.metrics import output_may_fail
     from segvisrl_jax.training.output import write_output
 
     episodes = min(TEST_EPISODES, 5 * config.evaluation.episodes)  # fewer after a smoke test
     slots = config.evaluation.num_slots
     result = evaluate(EvalOptions(run=run_dir, episodes=episodes, seed=RUN_TEST_SEED, slots=slots))
-    write_output(run_dir / "eval.json", as_json(result))
-    print(f"\n{episodes} test scenes: {report_line(result)}")
+    try:
+        write_output(run_dir / "eval.json", as_json(result))
+    finally:  # one may be on a full disk, and the other not
+        with output_may_fail():
+            print(f"\n{episodes} test scenes: {report_line(result)}")
 
 
 def _not_made(products: dict[Path, Callable[[], object]]) -> dict[Path, str]:
