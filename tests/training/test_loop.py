@@ -10,7 +10,7 @@ import pytest
 
 from segvisrl_jax.config import ConditionsConfig, ConfigError, preset_config, replace_fields
 from segvisrl_jax.training import loop
-from segvisrl_jax.training.checkpoint import Checkpoints, load_policy, save_policy
+from segvisrl_jax.training.checkpoint import MARK, Checkpoints, load_policy, save_policy
 from segvisrl_jax.training.metrics import read_metrics
 
 TINY = {
@@ -124,6 +124,7 @@ def test_a_run_that_ended_before_its_first_checkpoint_starts_from_its_policy_aga
     expected, _ = final_state(given)
     for left in (tmp_path / "second" / "checkpoints").iterdir():
         shutil.rmtree(left)
+    (tmp_path / "second" / MARK).unlink()
     (tmp_path / "second" / "checkpoints" / "2.orbax-checkpoint-tmp-0").mkdir()
     loop.train(replace_fields(given, resume=True), **QUIET)
     found, _ = final_state(given)
