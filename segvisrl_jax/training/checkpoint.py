@@ -93,8 +93,9 @@ class Checkpoints:
 
     def _mark(self) -> None:
         mark = self._run_dir / MARK
-        if not mark.exists():
-            mark.write_text("The run has checkpoints: without any, it does not begin again.\n")
+        with contextlib.suppress(OSError):  # the checkpoint is written, and worth more
+            if not mark.exists():
+                mark.write_text("The run has checkpoints: without any, it does not begin again.\n")
 
     def _start_again(self, updates: int) -> None:
         """Drops what a failed write left, and the manager, which counts it as written."""
@@ -163,7 +164,7 @@ class Checkpoints:
 
     def _tell_versions(self, path: Path) -> None:
         """Says what has changed since a checkpoint was made, which may change what comes of it."""
-        then, now = read_manifest(path).get("versions") or {}, library_versions()
+        then, now = read_json(path / MANIFEST)["about"].get("versions") or {}, library_versions()
         changed = [f"{name} {then[name]}, now {now.get(name)}" for name in then if then[name] != now.get(name)]
         if changed:
             self._say(f"the checkpoint of update {path.name} was made with {'; '.join(changed)}: results may differ")

@@ -10,7 +10,7 @@ import pytest
 from flax import struct
 
 from segvisrl_jax.config import ConfigError, TrainConfig, from_dict, preset_config, to_dict
-from segvisrl_jax.training.checkpoint import Checkpoints, load_policy, save_policy
+from segvisrl_jax.training.checkpoint import MARK, Checkpoints, load_policy, save_policy
 
 
 def state():
@@ -40,6 +40,15 @@ def test_an_older_state_is_not_written_over_a_newer_one(tmp_path):
         checkpoints.save(updates, state(), {"updates": updates})
     assert checkpoints.latest == 2
     assert checkpoints.restore_latest(state())[1] == {"updates": 2}
+    checkpoints.close()
+
+
+def test_a_checkpoint_stays_where_its_mark_cannot_be_written(tmp_path):
+    (tmp_path / MARK).symlink_to(tmp_path / "nowhere" / "mark")
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, state(), {"updates": 1})
+    assert checkpoints.latest == 1
+    assert checkpoints.restore_latest(state())[1] == {"updates": 1}
     checkpoints.close()
 
 
