@@ -77,7 +77,8 @@ class Trainer:
         self.cores = Cores(acting_cores(config.ppo.num_envs) if on_host else 1)
         self.batch = BatchEnv(env, config.ppo.num_envs // shard.count // self.cores.count)
         self.policy: Policy = network_policy(self.network, config.arch)
-        self.evaluator = Evaluator(RoverEnv(validation_env(config)), self.policy, config.evaluation.num_slots)
+        held_out = RoverEnv(validation_env(config))
+        self.evaluator = Evaluator(held_out, self.policy, config.evaluation.num_slots, self.devices)
         self._lay_out = self.devices.lay_out(lambda key: key, EVERYWHERE)
         self._split = self.devices.lay_out(lambda key: tuple(jax.random.split(key)), EVERYWHERE)
         self._init = self.devices.lay_out(self.learner.init, EVERYWHERE)
@@ -141,7 +142,7 @@ class Trainer:
     def evaluate(self, params: Any, seed: int) -> dict[str, Any]:
         """A policy on the validation scenes of a seed."""
         stream = scene_stream(seed, VALIDATION_STREAM)
-        finished = self.evaluator.run(self.devices.on_one(params), stream, self.config.evaluation.episodes)
+        finished = self.evaluator.run(params, stream, self.config.evaluation.episodes)
         return summarize(finished, self.evaluator.env)
 
     def _unroll_batch(self, shard: Shard, learner: LearnerState, actor: ActorState):
