@@ -129,7 +129,12 @@ class Trainer:
         return TrainingState(learner, self._begin(act_key), self._lay_out(update_key))
 
     def update(self, state: TrainingState) -> tuple[TrainingState, dict[str, Any], EpisodeLog]:
-        """One rollout and one learning update; the log as NumPy arrays."""
+        """One rollout and one learning update; the log as NumPy arrays.
+
+        The programs are queued one behind the other, so that a device does not wait between them. None is given its
+        buffers to write in: a late stop saves the state from before (``_Session.end_late``), and nothing else is as
+        large as something that comes out. It would spare 41 MB at 192 x 108, of the learner.
+        """
         next_key, key = self._split(state.update_key)
         actor, trajectory, last_value, log = self.act(state)
         learner, metrics = self._learn(state.learner, trajectory, last_value, key)
