@@ -1,5 +1,6 @@
 """``segvisrl bench``: how fast physics, rendering and learning run on this machine."""
 
+import functools
 import json
 import os
 import platform
@@ -26,13 +27,14 @@ from segvisrl_jax.config import (
     replace_fields,
     require,
     require_file_can_be_written,
+    require_folder_can_be_made,
 )
 from segvisrl_jax.cpu import num_cores
 from segvisrl_jax.machine.finding import GIB
 from segvisrl_jax.machine.growth import GrowthSizes
 from segvisrl_jax.machine.memory import peak_bytes
 
-Part = Literal["physics", "render", "policy", "update", "train", "start", "peers", "growth"]
+Part = Literal["physics", "render", "policy", "update", "train", "profile", "start", "peers", "growth"]
 FEW = {"num_envs": 8, "num_minibatches": 2}  # on a CPU, for the update: minibatches as large as the preset's
 ELSEWHERE = ("start", "growth")  # measured in processes of their own
 PlainRenderer = Literal["scanline", "gl", "warp", "mujoco.Renderer"]
@@ -45,11 +47,11 @@ class BenchOptions:
 
     parts: tyro.conf.Positional[tuple[Part, ...]] = ("physics", "render", "train")
     """physics, render, train; these three where none is named. policy, update: the network's decisions and learning.
-    start: what comes before a training's first update. peers: PyTorch and sb3-contrib beside this project (needs the
-    extra [sb3]). growth: time and memory against rocks, environments, image and unroll, one of them varied at a time;
-    20 to 25 minutes. Each says what share of the machine's limit it reaches, which is measured beside it: of a large
-    copy for physics' states and rendered observations, of a large matrix product for the network's work; and the most
-    memory that the process had until then."""
+    profile: where an update's time goes, by its parts and by the operations that take longest. start: what comes before
+    a training's first update. peers: PyTorch and sb3-contrib beside this project (needs the extra [sb3]). growth: time
+    and memory against rocks, environments, image and unroll, one of them varied at a time; 20 to 25 minutes. Rows have
+    the most memory that the process had until then, and the share of a limit that was measured beside them: of a large
+    copy (physics, render) or of a large matrix product (policy, update, train, peers)."""
     batch: int = 32
     """Environments at once, for physics."""
     batches: tuple[int, ...] = (1, 16, 64, 256)
@@ -67,6 +69,8 @@ class BenchOptions:
     """Where to write the result as JSON."""
     plot: Path | None = None
     """Where to draw growth (.png); None: beside the JSON, with its name."""
+    trace: Path | None = None
+    """Where the trace behind the profile stays, for TensorBoard's profile plugin or ui.perfetto.dev; None: nowhere."""
     growth: GrowthSizes = field(default_factory=GrowthSizes)
 
     def __post_init__(self) -> None:
@@ -80,6 +84,9 @@ class BenchOptions:
         for option, path in (("--json", self.json), ("--plot", self.plot)):
             if path is not None:
                 require_file_can_be_written(path, option)
+        if self.trace is not None:
+            require("profile" in self.parts, "--trace", str(self.trace), "left out without the part profile")
+            require_folder_can_be_made(self.trace, "--trace")
         if self.plot is not None:
             require("growth" in self.parts, "--plot", str(self.plot), "left out without the part growth")
             require(self.plot.suffix == ".png", "--plot", str(self.plot), "a name that ends in .png")
@@ -96,6 +103,7 @@ def run(options: Sequence[str]) -> int:
         "policy": _policy,
         "update": _update,
         "train": _train,
+        "profile": _profile,
         "start": _start,
         "peers": _peers,
         "growth": _growth,
@@ -147,7 +155,7 @@ def _physics(asked: BenchOptions):
     yield _copy_row(limit)
     config = preset_config("mlp", asked.preset).env
     for engine in asked.engines:
-        env = _or_none(lambda engine=engine: RoverEnv(replace_fields(config, engine=engine)))
+        env = _or_none(functools.partial(RoverEnv, replace_fields(config, engine=engine)))
         if env is not None:
             row = {"name": engine, **physics_row(env, asked.batch, asked.repeats)}
             yield row | _share_of_copy(row, limit)
@@ -191,8 +199,8 @@ def _look_or_none(name: str, config: EnvConfig) -> Callable[[Any], Any] | None:
     if name == "mujoco.Renderer":
         from segvisrl_jax.machine.mujoco_renderer import mujoco_look
 
-        return _or_none(lambda: mujoco_look(config), "mujoco.Renderer: ")
-    env = _or_none(lambda: RoverEnv(replace_fields(config, renderer=name)))
+        return _or_none(functools.partial(mujoco_look, config), "mujoco.Renderer: ")
+    env = _or_none(functools.partial(RoverEnv, replace_fields(config, renderer=name)))
     return None if env is None else jax.jit(jax.vmap(env.observe))
 
 
@@ -236,6 +244,12 @@ def _train(asked: BenchOptions):
         observations = "drawn again" if redraw else "kept"
         share = share_of_matrix_product(flop, row["decisions_per_s"], limit)
         yield {"name": f"{asked.arch}, {asked.preset}", "observations": observations, **row, **share}
+
+
+def _profile(asked: BenchOptions):
+    from segvisrl_jax.machine.profile import profile_rows
+
+    return profile_rows(preset_config(asked.arch, asked.preset), asked.repeats, asked.trace)
 
 
 def _start(asked: BenchOptions):

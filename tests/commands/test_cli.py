@@ -66,6 +66,7 @@ def segvisrl(*words, cwd):
         (["bench", "render", "--batches", "0"], ["--batches", "0"]),
         (["bench", "render", "--json", "no/such/folder/x.json"], ["--json", "folder that exists"]),
         (["bench", "render", "--plot", "x.png"], ["--plot", "x.png", "growth"]),
+        (["bench", "train", "--trace", "x"], ["--trace", "x", "profile"]),
         (["bench", "growth", "--plot", "x.pdf"], ["--plot", "x.pdf", ".png"]),
         (["bench", "growth", "--growth.most-gib", "0"], ["most-gib", "0", "above 0"]),
         (["bench", "growth", "--growth.scales", "900"], ["scale", "900", "at least 4 pixels"]),
