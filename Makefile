@@ -15,6 +15,7 @@ BENCH_DIR ?= docs/benchmarks
 GPU_PRESET ?= gpu
 GPU_BATCH ?= 4096
 GPU_FRAMES ?= 64 512
+GPU_TRACE ?= trace_gpu
 NOTEBOOKS ?= quickstart bearings curves downsampling failures learning_curves trajectories
 
 $(foreach name,arch preset seed steps run args episodes policy,$(if $(findstring command line,$(origin $(name))),\
@@ -68,11 +69,12 @@ baselines: $(READY) ## the P controller and the random one on 10,000 scenes
 	@$(BIN)/segvisrl eval --controller p --episodes 10000 --seed $(SEED) $(ARGS)
 	@$(BIN)/segvisrl eval --controller random --episodes 10000 --seed $(SEED) $(ARGS)
 
-bench-gpu: $(READY) ## measure all parts with the gpu preset, in less than ten minutes: BENCH_DIR/*_gpu.json
+bench-gpu: $(READY) ## measure all parts with the gpu preset, in less than ten minutes: BENCH_DIR/*_gpu.json; a trace in GPU_TRACE
 	@$(BIN)/segvisrl bench physics --engines mjx --batch $(GPU_BATCH) --repeats 3 --json $(BENCH_DIR)/physics_gpu.json $(ARGS)
 	@$(BIN)/segvisrl bench render --renderers scanline --batches $(GPU_FRAMES) --repeats 3 --json $(BENCH_DIR)/render_gpu.json $(ARGS)
 	@$(BIN)/segvisrl bench policy update --preset $(GPU_PRESET) --repeats 3 --json $(BENCH_DIR)/update_gpu.json $(ARGS)
 	@$(BIN)/segvisrl bench train --preset $(GPU_PRESET) --repeats 3 --json $(BENCH_DIR)/train_gpu.json $(ARGS)
+	@$(BIN)/segvisrl bench profile --preset $(GPU_PRESET) --repeats 3 --trace $(GPU_TRACE) --json $(BENCH_DIR)/profile_gpu.json $(ARGS)
 
 table: $(READY) ## the evaluations in docs/results side by side: docs/results_table.md
 	@$(BIN)/segvisrl table docs/results --output docs/results_table.md $(ARGS)

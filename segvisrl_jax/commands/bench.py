@@ -1,5 +1,6 @@
 """``segvisrl bench``: how fast physics, rendering and learning run on this machine."""
 
+import functools
 import json
 import os
 import platform
@@ -26,12 +27,16 @@ from segvisrl_jax.config import (
     replace_fields,
     require,
     require_file_can_be_written,
+    require_folder_can_be_made,
 )
 from segvisrl_jax.cpu import num_cores
+from segvisrl_jax.machine.finding import GIB
 from segvisrl_jax.machine.growth import GrowthSizes
+from segvisrl_jax.machine.memory import peak_bytes
 
-Part = Literal["physics", "render", "policy", "update", "train", "start", "peers", "growth"]
+Part = Literal["physics", "render", "policy", "update", "train", "profile", "start", "peers", "growth"]
 FEW = {"num_envs": 8, "num_minibatches": 2}  # on a CPU, for the update: minibatches as large as the preset's
+ELSEWHERE = ("start", "growth")  # measured in processes of their own
 PlainRenderer = Literal["scanline", "gl", "warp", "mujoco.Renderer"]
 """The project's renderers, and MuJoCo's Python class as one would use it without this project."""
 
@@ -41,10 +46,12 @@ class BenchOptions:
     """Times parts of the pipeline: medians of repeats, compilation apart. Prints tables; JSON where asked."""
 
     parts: tyro.conf.Positional[tuple[Part, ...]] = ("physics", "render", "train")
-    """physics, render, train; these three where none is named. policy, update: the network's decisions and learning, as
-    shares of what the machine does in a large matrix product. start: what comes before a training's first update.
-    peers: PyTorch and sb3-contrib beside this project (needs the extra [sb3]). growth: time and memory against rocks,
-    environments, image and unroll, one of them varied at a time; 20 to 25 minutes."""
+    """physics, render, train; these three where none is named. policy, update: the network's decisions and learning.
+    profile: where an update's time goes, by its parts and by the operations that take longest. start: what comes before
+    a training's first update. peers: PyTorch and sb3-contrib beside this project (needs the extra [sb3]). growth: time
+    and memory against rocks, environments, image and unroll, one of them varied at a time; 20 to 25 minutes. Rows have
+    the most memory that the process had until then, and the share of a limit that was measured beside them: of a large
+    copy (physics, render) or of a large matrix product (policy, update, train, peers)."""
     batch: int = 32
     """Environments at once, for physics."""
     batches: tuple[int, ...] = (1, 16, 64, 256)
@@ -62,6 +69,8 @@ class BenchOptions:
     """Where to write the result as JSON."""
     plot: Path | None = None
     """Where to draw growth (.png); None: beside the JSON, with its name."""
+    trace: Path | None = None
+    """Where the trace behind the profile stays, for TensorBoard's profile plugin or ui.perfetto.dev; None: nowhere."""
     growth: GrowthSizes = field(default_factory=GrowthSizes)
 
     def __post_init__(self) -> None:
@@ -75,6 +84,9 @@ class BenchOptions:
         for option, path in (("--json", self.json), ("--plot", self.plot)):
             if path is not None:
                 require_file_can_be_written(path, option)
+        if self.trace is not None:
+            require("profile" in self.parts, "--trace", str(self.trace), "left out without the part profile")
+            require_folder_can_be_made(self.trace, "--trace")
         if self.plot is not None:
             require("growth" in self.parts, "--plot", str(self.plot), "left out without the part growth")
             require(self.plot.suffix == ".png", "--plot", str(self.plot), "a name that ends in .png")
@@ -91,6 +103,7 @@ def run(options: Sequence[str]) -> int:
         "policy": _policy,
         "update": _update,
         "train": _train,
+        "profile": _profile,
         "start": _start,
         "peers": _peers,
         "growth": _growth,
@@ -102,7 +115,7 @@ def run(options: Sequence[str]) -> int:
     for part in asked.parts:
         measured = []
         for row in measure[part](asked):
-            measured.append(row)
+            measured.append(row if part in ELSEWHERE else {**row, "memory_gib": peak_bytes() / GIB})
             print(f"{part}: rows measured: {len(measured)}", end="\r", file=sys.stderr, flush=True)
         _print_table(part, measured)
         rows += [{"part": part, **row} for row in measured]
@@ -133,19 +146,28 @@ def machine() -> dict[str, Any]:
 
 
 def _physics(asked: BenchOptions):
+    """Both engines, beside a copy in the same run."""
+    from segvisrl_jax.env.rover_env import RoverEnv
+    from segvisrl_jax.machine.limits import copy_bytes_per_s
     from segvisrl_jax.machine.speed import physics_row
 
+    limit = copy_bytes_per_s(asked.repeats)
+    yield _copy_row(limit)
     config = preset_config("mlp", asked.preset).env
     for engine in asked.engines:
-        env = _env_or_none(replace_fields(config, engine=engine))
+        env = _or_none(functools.partial(RoverEnv, replace_fields(config, engine=engine)))
         if env is not None:
-            yield {"name": engine, **physics_row(env, asked.batch, asked.repeats)}
+            row = {"name": engine, **physics_row(env, asked.batch, asked.repeats)}
+            yield row | _share_of_copy(row, limit)
 
 
 def _render(asked: BenchOptions):
     """Frames a second of each renderer on the same scenes, and the ratio to MuJoCo's through this project (gl)."""
+    from segvisrl_jax.machine.limits import copy_bytes_per_s
     from segvisrl_jax.machine.speed import render_row
 
+    limit = copy_bytes_per_s(asked.repeats)
+    yield _copy_row(limit)
     base = replace_fields(preset_config("cnn_lstm", asked.preset).env, scale=asked.scale)
     for num_rocks in asked.num_rocks:
         config = replace_fields(base, num_rocks=num_rocks)
@@ -156,57 +178,30 @@ def _render(asked: BenchOptions):
             ]
             reference = next((row["frames_per_s"] for row in timed if row["name"] == "gl"), None)
             for row in timed:
-                yield row if reference is None else {**row, "ratio_to_gl": row["frames_per_s"] / reference}
+                ratio = {} if reference is None else {"ratio_to_gl": row["frames_per_s"] / reference}
+                yield row | _share_of_copy(row, limit) | ratio
+
+
+def _copy_row(limit: float) -> dict[str, Any]:
+    return {"name": "copy", "gbyte_per_s": limit / 1e9}
+
+
+def _share_of_copy(row: dict[str, Any], limit: float) -> dict[str, float]:
+    return {"percent_of_copy": 100e9 * row["gbyte_per_s"] / limit}
 
 
 def _look_or_none(name: str, config: EnvConfig) -> Callable[[Any], Any] | None:
     """From a batch of states to their observations; None where the renderer cannot run here."""
     import jax
 
-    if name == "mujoco.Renderer":
-        return _mujoco_look(config)
-    env = _env_or_none(replace_fields(config, renderer=name))
-    return None if env is None else jax.jit(jax.vmap(env.observe))
-
-
-def _mujoco_look(config: EnvConfig) -> Callable[[Any], Any] | None:
-    """``mujoco.Renderer`` with segmentation on, one frame after another, then ``colour_and_resample``."""
-    import jax
-    import mujoco
-    import numpy as np
-    from mujoco.rendering.classic import gl_context
-
-    from segvisrl_jax.env.model import CAMERA_NAME
     from segvisrl_jax.env.rover_env import RoverEnv
-    from segvisrl_jax.vision.classes import GEOM_PREFIXES, PALETTE
-    from segvisrl_jax.vision.gl_context import open_gl_context
-    from segvisrl_jax.vision.resample import downsample
 
-    gl_context.GLContext = open_gl_context  # else it looks for a display where MUJOCO_GL is not set
-    env = RoverEnv(replace_fields(config, obs="state"))
-    camera, model = config.camera, env.mj_model
-    try:
-        renderer = mujoco.Renderer(model, camera.height_px, camera.width_px)
-    except ConfigError as error:
-        print(f"left out: mujoco.Renderer: {error}", file=sys.stderr)
-        return None
-    renderer.enable_segmentation_rendering()
-    names = [model.geom(geom).name for geom in range(model.ngeom)]
-    of_geom = [next((k for prefix, k in GEOM_PREFIXES.items() if name.startswith(prefix)), 0) for name in names]
-    colours = np.append(PALETTE[of_geom], PALETTE[:1], axis=0)  # what is no geom (-1) is space
-    shrink = jax.jit(lambda image: downsample(image, camera.scale))
+    if name == "mujoco.Renderer":
+        from segvisrl_jax.machine.mujoco_renderer import mujoco_look
 
-    def look(states: Any) -> list[Any]:
-        arrays = jax.tree.map(np.asarray, states)
-        images = []
-        for number in range(len(arrays.num_decisions)):
-            data = env.to_mujoco(jax.tree.map(lambda leaf, number=number: leaf[number], arrays))
-            mujoco.mj_forward(model, data)
-            renderer.update_scene(data, CAMERA_NAME)
-            images.append(shrink(colours[renderer.render()[..., 0]]))
-        return images
-
-    return look
+        return _or_none(functools.partial(mujoco_look, config), "mujoco.Renderer: ")
+    env = _or_none(functools.partial(RoverEnv, replace_fields(config, renderer=name)))
+    return None if env is None else jax.jit(jax.vmap(env.observe))
 
 
 def _policy(asked: BenchOptions):
@@ -236,14 +231,25 @@ def _update(asked: BenchOptions):
 
 
 def _train(asked: BenchOptions):
-    """Acting and learning; images kept from acting, or drawn again in every epoch."""
-    from segvisrl_jax.machine.speed import learning_row
+    """Acting and learning; images kept from acting, or drawn again in every epoch. The network's work is the share."""
+    from segvisrl_jax.machine.limits import matrix_flop_per_s
+    from segvisrl_jax.machine.speed import learning_row, share_of_matrix_product, training_flop
 
+    limit = matrix_flop_per_s(asked.repeats)
+    yield {"name": "matrix product", "gflop_per_s": limit / 1e9}
     config = preset_config(asked.arch, asked.preset)
+    flop = training_flop(config)
     for redraw in (False, True) if config.env.obs in IMAGE_OBSERVATIONS else (False,):
         row = learning_row(replace_fields(config, redraw_observations=redraw), asked.repeats)
         observations = "drawn again" if redraw else "kept"
-        yield {"name": f"{asked.arch}, {asked.preset}", "observations": observations, **row}
+        share = share_of_matrix_product(flop, row["decisions_per_s"], limit)
+        yield {"name": f"{asked.arch}, {asked.preset}", "observations": observations, **row, **share}
+
+
+def _profile(asked: BenchOptions):
+    from segvisrl_jax.machine.profile import profile_rows
+
+    return profile_rows(preset_config(asked.arch, asked.preset), asked.repeats, asked.trace)
 
 
 def _start(asked: BenchOptions):
@@ -281,14 +287,12 @@ def _conclude_growth(asked: BenchOptions, rows: Sequence[dict[str, Any]]) -> lis
     return [{"part": "growth exponents", **row} for row in exponents]
 
 
-def _env_or_none(config):
-    """The environment, or None where its parts cannot run here (said aloud)."""
-    from segvisrl_jax.env.rover_env import RoverEnv
-
+def _or_none(make: Callable[[], Any], name: str = "") -> Any:
+    """What it makes, or None where its parts cannot run here (said aloud)."""
     try:
-        return RoverEnv(config)
+        return make()
     except ConfigError as error:
-        print(f"left out: {error}", file=sys.stderr)
+        print(f"left out: {name}{error}", file=sys.stderr)
         return None
 
 
@@ -302,8 +306,8 @@ def _processor() -> str:
 
 
 def _print_table(part: str, rows: Sequence[dict[str, Any]]) -> None:
-    """A markdown table with a column for every name in any row."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
+    """A markdown table with a column for every name in any row, in the order of the row that has most."""
+    names = list(dict.fromkeys(name for row in sorted(rows, key=len, reverse=True) for name in row))
     print(f"{part}\n| {' | '.join(name.replace('_', ' ') for name in names)} |")
     print("|" + "---|" * len(names))
     for row in rows:

@@ -17,7 +17,7 @@ from segvisrl_jax.agent.loss import Trajectory
 from segvisrl_jax.agent.networks import ACTION_SIZE, Network, make_network
 from segvisrl_jax.agent.ppo import make_learner
 from segvisrl_jax.config import PPOConfig, TrainConfig, from_dict, replace_fields
-from segvisrl_jax.env.rover_env import RoverEnv
+from segvisrl_jax.env.rover_env import RoverEnv, observation_shape
 from segvisrl_jax.env.wrappers import BatchEnv
 from segvisrl_jax.machine.finding import GIB
 from segvisrl_jax.machine.limits import time_calls
@@ -33,21 +33,31 @@ def measure(config: TrainConfig, repeats: int) -> dict[str, float]:
     Physics, rendering and the network's decision are those of all environments at once. Learning is a gradient step
     on one minibatch, times the epochs; the whole batch is there, as it is in training, and holds zeros.
     """
-    num_envs, env = config.ppo.num_envs, RoverEnv(config.env)
-    batch = BatchEnv(env, num_envs)
+    network = make_network(config.arch, config.network, observation_shape(config.env))
+    parts = acting_parts_ms(config, network, repeats)
+    return {
+        "physics_ms": parts["physics"],
+        "rendering_ms": parts["rendering"],
+        "acting_ms": parts["network"],
+        "learning_ms": 1e3 * _learning_s(network, config.ppo, repeats),
+        "memory_gib": peak_bytes() / GIB,
+    }
+
+
+def acting_parts_ms(config: TrainConfig, network: Network, repeats: int) -> dict[str, float]:
+    """Milliseconds a decision of physics, rendering and the network, each for all environments at once."""
+    num_envs = config.ppo.num_envs
+    batch = BatchEnv(RoverEnv(config.env), num_envs)
     state = jax.jit(batch.reset)(jax.random.key(0))
     action = jnp.full((num_envs, ACTION_SIZE), STEADY_ACTION)
-    network = make_network(config.arch, config.network, env.observation_shape)
 
     def of_a_decision(call: Callable[[], Any]) -> float:
         return 1e3 * time_calls(call, repeats, ENOUGH_S)[1] / num_envs
 
     return {
-        "physics_ms": of_a_decision(functools.partial(jax.jit(batch.step), state, action)),
-        "rendering_ms": of_a_decision(functools.partial(jax.jit(batch.observe), state)),
-        "acting_ms": of_a_decision(_acting(network, num_envs)),
-        "learning_ms": 1e3 * _learning_s(network, config.ppo, repeats),
-        "memory_gib": peak_bytes() / GIB,
+        "physics": of_a_decision(functools.partial(jax.jit(batch.step), state, action)),
+        "rendering": of_a_decision(functools.partial(jax.jit(batch.observe), state)),
+        "network": of_a_decision(_acting(network, num_envs)),
     }
 
 

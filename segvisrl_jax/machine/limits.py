@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 LEAST_TIMED_S = 0.1  # what is shorter is drowned in noise
 MATRIX_SIZE, ACCELERATOR_MATRIX_SIZE = 2048, 8192  # large enough that only arithmetic counts
+COPY_BYTES, ACCELERATOR_COPY_BYTES = 2**26, 2**28  # more than a core's caches hold; little beside what is measured
 
 
 def matrix_flop_per_s(repeats: int) -> float:
@@ -22,6 +23,14 @@ def matrix_flop_per_s(repeats: int) -> float:
     left, right = jax.random.normal(jax.random.key(0), (2, size, size))
     product = jax.jit(jnp.matmul)
     return 2 * size**3 / time_calls(lambda: product(left, right), repeats)[1]
+
+
+def copy_bytes_per_s(repeats: int) -> float:
+    """Bytes that a copy of a large array reads and writes, with 1 added, which makes XLA use all cores."""
+    size = COPY_BYTES if jax.default_backend() == "cpu" else ACCELERATOR_COPY_BYTES
+    source = jnp.zeros(size // 4, jnp.float32)
+    copied = jax.jit(lambda numbers: numbers + 1)
+    return 2 * size / time_calls(lambda: copied(source), repeats)[1]
 
 
 def flop_of(work: Callable[..., Any], *given: Any) -> float:

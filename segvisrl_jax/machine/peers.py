@@ -21,7 +21,8 @@ from segvisrl_jax.adapters.stable_baselines3 import LunarRoverVecEnv
 from segvisrl_jax.config import ConfigError, NetworkConfig, TrainConfig, replace_fields
 from segvisrl_jax.cpu import num_cores
 from segvisrl_jax.env.rover_env import observation_shape
-from segvisrl_jax.machine.speed import learning_row
+from segvisrl_jax.machine.limits import matrix_flop_per_s
+from segvisrl_jax.machine.speed import learning_row, look_flop, training_flop
 from segvisrl_jax.training.loop import Trainer
 
 SCALES = (10.0, 40.0)  # the paper's 192 x 108, and the 48 x 27 of the preset for a CPU
@@ -39,22 +40,36 @@ def peer_rows(preset: TrainConfig, repeats: int, scales: Sequence[float] = SCALE
         scales: downsampling of the images whose gradients are timed.
 
     Yields:
-        Rows with what was measured, ours, theirs, and the ratio.
+        Rows with what was measured, ours, theirs, the ratio, and the network's operations on each side as a share of
+        what JAX's matrix product makes.
     """
+    limit = matrix_flop_per_s(repeats)
+    yield {"name": "matrix product", "gflop_per_s": limit / 1e9}
     torch.set_num_threads(num_cores())
     for scale in scales:
         few = {"num_envs": FEW_ENVS, "num_minibatches": FEW_MINIBATCHES, "num_epochs": 1}
         config = replace_fields(preset, scale=scale, kl_stop=0.0, **few)
         ours, theirs = _in_turn([_our_gradient(config), _torch_gradient(config)], repeats)
         rows, columns = config.env.camera.observation_size_px
-        yield _row(f"gradient images/s, {columns} x {rows}", ours, "PyTorch", theirs)
+        share = 3 * look_flop(config) / limit
+        yield _row(f"gradient images/s, {columns} x {rows}", ours, "PyTorch", theirs, share)
     ours = learning_row(preset, repeats)["decisions_per_s"]
     theirs, renderer = sb3_decisions_per_s(preset)
-    yield _row("training decisions/s", ours, f"sb3-contrib RecurrentPPO, renderer {renderer}", theirs)
+    share = training_flop(preset) / limit
+    yield _row("training decisions/s", ours, f"sb3-contrib RecurrentPPO, renderer {renderer}", theirs, share)
 
 
-def _row(what: str, ours: float, peer: str, theirs: float) -> dict[str, Any]:
-    return {"name": what, "segvisrl_jax": ours, "peer": peer, "theirs": theirs, "ratio": ours / theirs}
+def _row(what: str, ours: float, peer: str, theirs: float, share_of_limit: float) -> dict[str, Any]:
+    """``share_of_limit``: of a second, that one of them takes at the speed of a matrix product."""
+    return {
+        "name": what,
+        "segvisrl_jax": ours,
+        "peer": peer,
+        "theirs": theirs,
+        "ratio": ours / theirs,
+        "percent_of_matrix_product": 100 * ours * share_of_limit,
+        "theirs_percent_of_matrix_product": 100 * theirs * share_of_limit,
+    }
 
 
 class ResidualBlock(nn.Module):

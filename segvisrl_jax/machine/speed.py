@@ -1,9 +1,12 @@
 """How fast the parts of the pipeline run: the measurements behind ``segvisrl bench`` and ``segvisrl doctor``.
 
-Compilation is timed apart. A row is plain JSON data.
+Compilation is timed apart. A row is plain JSON data. The network's work is what XLA counts for looking forward, with
+its own convolutions; learning from an image is three times that: forward, for the gradient of what is inside, and for
+that of the parameters.
 """
 
 import functools
+import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -12,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from segvisrl_jax.agent.loss import make_batch
+from segvisrl_jax.agent.networks import make_network
 from segvisrl_jax.config import IMAGE_OBSERVATIONS, EnvConfig, TrainConfig, replace_fields
 from segvisrl_jax.cpu import num_cores
 from segvisrl_jax.env.rover_env import RoverEnv, observation_shape
@@ -23,30 +27,41 @@ STEADY_ACTION = 0.7  # wheel speeds while physics is timed, as a share of the to
 
 
 def physics_row(env: RoverEnv, num_envs: int, repeats: int) -> dict[str, Any]:
-    """Decisions a second of an environment that does not look."""
+    """Decisions a second of an environment that does not look.
+
+    Its bytes are those of the state alone, read and written once in each of MuJoCo's steps: a solver's own numbers
+    stay in caches at best.
+    """
     task, physics = env.config.task, env.config.physics
     batch = BatchEnv(env, num_envs)
     state = jax.jit(batch.reset)(jax.random.key(0))
     step, action = jax.jit(batch.step), jnp.full((num_envs, 2), STEADY_ACTION)
     compile_s, seconds = time_calls(functools.partial(step, state, action), repeats)
     rate = num_envs / seconds
+    steps_per_s = rate * round(task.decision_dt_s / physics.timestep_s)
     return {
         "batch": num_envs,
         "decisions_per_s": rate,
-        "mujoco_steps_per_s": rate * round(task.decision_dt_s / physics.timestep_s),
+        "mujoco_steps_per_s": steps_per_s,
+        "gbyte_per_s": 2 * _num_bytes(state.rover.physics) / num_envs * steps_per_s / 1e9,
         "compile_s": compile_s,
     }
 
 
 def render_row(look: Callable[[Any], Any], config: EnvConfig, num_frames: int, repeats: int) -> dict[str, Any]:
-    """Frames a second of ``look``, which makes observations of a batch of states."""
+    """Frames a second of ``look``, which makes observations of a batch of states.
+
+    Its bytes are those of the observations, written once: no renderer needs to keep the image that it shrinks.
+    """
     scenes = RoverEnv(replace_fields(config, obs="state"))
     states = jax.jit(jax.vmap(scenes.initial_state))(jax.random.split(jax.random.key(0), num_frames))
     compile_s, seconds = time_calls(functools.partial(look, states), repeats)
     rows, columns = config.camera.observation_size_px
     image = f"{config.camera.width_px} x {config.camera.height_px} to {columns} x {rows}"
     row = {"image": image, "rocks": config.scene.num_rocks, "batch": num_frames}
-    return {**row, "frames_per_s": num_frames / seconds, "compile_s": compile_s}
+    rate = num_frames / seconds
+    observation_bytes = math.prod(observation_shape(config))  # a byte for each of its numbers
+    return {**row, "frames_per_s": rate, "gbyte_per_s": observation_bytes * rate / 1e9, "compile_s": compile_s}
 
 
 def learning_row(config: TrainConfig, repeats: int) -> dict[str, Any]:
@@ -59,7 +74,7 @@ def learning_row(config: TrainConfig, repeats: int) -> dict[str, Any]:
     learn = functools.partial(trainer.learner.update, state.learner, trajectory, last_value, jax.random.key(0))
     compile_learn, learn_s = time_calls(learn, repeats)
     return {
-        "observation_mib": sum(leaf.nbytes for leaf in jax.tree.leaves(trajectory.observation)) / 2**20,
+        "observation_mib": _num_bytes(trajectory.observation) / 2**20,
         "acting_decisions_per_s": decisions / act_s,
         "gradient_images_per_s": decisions * config.ppo.num_epochs / learn_s,
         "decisions_per_s": decisions / (act_s + learn_s),
@@ -78,29 +93,25 @@ def policy_rows(config: TrainConfig, repeats: int, limit_flop_per_s: float) -> I
         compile_s, seconds = time_calls(functools.partial(step, *given), repeats)
         flop = flop_of(network.portable.step, *given)
         row = {"name": _named(config), "batch": num_envs, "decisions_per_s": num_envs / seconds}
-        yield row | _share(flop / num_envs, num_envs / seconds, limit_flop_per_s) | {"compile_s": compile_s}
+        share = share_of_matrix_product(flop / num_envs, num_envs / seconds, limit_flop_per_s)
+        yield row | share | {"compile_s": compile_s}
 
 
 def update_rows(config: TrainConfig, repeats: int, limit_flop_per_s: float) -> Iterator[dict[str, Any]]:
-    """A learning update: all of it, and where Python drives the gradient, its parts.
-
-    The work is counted as three times that of looking forward: forward, for the gradient of what is inside, and for
-    that of the parameters.
-    """
+    """A learning update: all of it, and where Python drives the gradient, its parts."""
     config = replace_fields(config, kl_stop=0.0)
     trainer = Trainer(config)
     state = trainer.start()
     _, trajectory, last_value, _ = trainer.act(state)
     learner, network, params = trainer.learner, trainer.network, state.learner.params
     one = jnp.zeros((1, *network.observation_shape), network.observation_dtype)
-    counted = network.portable  # XLA does not know how much work kernels do
-    maps_flop = flop_of(counted.maps, params, one)
-    all_flop = flop_of(counted.step, params, network.initial_carry((1,)), one, jnp.zeros(1))
+    maps_flop = flop_of(network.portable.maps, params, one)
+    all_flop = look_flop(config)
     update = functools.partial(learner.update, state.learner, trajectory, last_value, jax.random.key(0))
     compile_s, seconds = time_calls(update, repeats)
     rate = config.ppo.decisions_per_update * config.ppo.num_epochs / seconds
     row = {"name": _named(config), "phase": "all", "ms_an_image": 1e3 / rate, "images_per_s": rate}
-    yield row | _share(3 * all_flop, rate, limit_flop_per_s) | {"compile_s": compile_s}
+    yield row | share_of_matrix_product(3 * all_flop, rate, limit_flop_per_s) | {"compile_s": compile_s}
     if learner.execution != "host":
         return
     batch, _ = make_batch(trajectory, last_value, config.ppo)
@@ -118,7 +129,7 @@ def update_rows(config: TrainConfig, repeats: int, limit_flop_per_s: float) -> I
         for name, (call, flop) in parts.items():
             rate = num_images / time_calls(call, repeats)[1]
             row = {"name": _named(config), "phase": name, "ms_an_image": 1e3 / rate, "images_per_s": rate}
-            yield row | _share(flop, rate, limit_flop_per_s)
+            yield row | share_of_matrix_product(flop, rate, limit_flop_per_s)
 
 
 def _named(config: TrainConfig) -> str:
@@ -127,7 +138,25 @@ def _named(config: TrainConfig) -> str:
     return f"{config.arch}, {config.preset}{image}"
 
 
-def _share(flop: float, rate: float, limit_flop_per_s: float) -> dict[str, Any]:
+def look_flop(config: TrainConfig) -> float:
+    """Operations of the network for looking at one observation and deciding."""
+    network = make_network(config.arch, config.network, observation_shape(config.env))
+    params = jax.eval_shape(network.init, jax.random.key(0))
+    one = jnp.zeros((1, *network.observation_shape), network.observation_dtype)
+    # XLA does not know how much work kernels do.
+    return flop_of(network.portable.step, params, network.initial_carry((1,)), one, jnp.zeros(1))
+
+
+def training_flop(config: TrainConfig) -> float:
+    """Operations of the network for a decision of a training: to act once, and to learn from it in every epoch."""
+    return (1 + 3 * config.ppo.num_epochs) * look_flop(config)
+
+
+def _num_bytes(tree: Any) -> int:
+    return sum(leaf.nbytes for leaf in jax.tree.leaves(tree))
+
+
+def share_of_matrix_product(flop: float, rate: float, limit_flop_per_s: float) -> dict[str, Any]:
     """How much work one of them is, how fast it is done, and how much of the machine's best that is."""
     done = flop * rate
     return {

@@ -58,10 +58,6 @@ class Devices:
         # Without check_vma, gradients stay a device's own until the learner averages them, once a step.
         return jax.jit(jax.shard_map(work, mesh=self.mesh, in_specs=takes, out_specs=gives, check_vma=False))
 
-    def on_one(self, tree: Any) -> Any:
-        """What lies everywhere, for programs of one device."""
-        return tree if self.mesh is None else jax.device_get(tree)
-
     def gather(self, tree: Any) -> Any:
         """What lies on several devices, as NumPy arrays."""
         return jax.device_get(tree if self.mesh is None else self._gather(tree))

@@ -3,8 +3,8 @@
 Episode i of a seed is always the same scene (``fold_in`` of the stream's key with i), however many episodes are
 driven at a time and whoever drives.
 
-A policy that looks at images drives on every core of a CPU (``training.cores``): each has its share of the slots, and
-of N cores the first one has the episodes 0, N, 2 N, and so on.
+A policy that looks at images drives on every core of a CPU (``training.cores``), and any on all devices of a training:
+each of these N parts has its share of the slots, and the first one has the episodes 0, N, 2 N, and so on.
 """
 
 import dataclasses
@@ -23,6 +23,7 @@ from segvisrl_jax.config import IMAGE_OBSERVATIONS
 from segvisrl_jax.env.rover_env import RoverEnv
 from segvisrl_jax.env.wrappers import select
 from segvisrl_jax.training.cores import acting_cores
+from segvisrl_jax.training.devices import BY_ENV, BY_TIME_AND_ENV, EVERYWHERE, Devices
 from segvisrl_jax.training.policy import Policy
 from segvisrl_jax.training.shortest_path import shortest_path_m
 from segvisrl_jax.training.statistics import path_ratio, spl, wilson_interval
@@ -33,11 +34,11 @@ DECISIONS_PER_CALL = 10  # of every slot between two looks of the host at what h
 
 @struct.dataclass
 class Slots:
-    """S episodes that are being driven, on one core."""
+    """S episodes that are being driven, by one part; what all devices have lies along the first axis."""
 
     rover: RoverState
     episode: Int32[Array, "S"]  # which episode each slot drives; beyond the last: idle
-    next_episode: Int32[Array, ""]
+    next_episode: Int32[Array, "1"]
     is_first: Array
     carry: Any
 
@@ -58,17 +59,31 @@ class Finished:
 
 @dataclasses.dataclass
 class Evaluator:
-    """Drives one policy over numbered scenes. Compiles once; ``run`` may be called for many parameters."""
+    """Drives one policy over numbered scenes. Compiles once; ``run`` may be called for many parameters.
+
+    Attributes:
+        env: what is driven in.
+        policy: what drives.
+        num_slots: episodes that are driven at a time; rounded up to as many on each device.
+        devices: of a training, on which the parameters lie; one where none are given. ``run`` is called by all
+            processes then, and gives all of them the same.
+    """
 
     env: RoverEnv
     policy: Policy
     num_slots: int
+    devices: Devices = dataclasses.field(default_factory=lambda: Devices(1))
 
     def __post_init__(self) -> None:
         looks = self.policy.observes and self.env.config.obs in IMAGE_OBSERVATIONS
-        self._num_cores = acting_cores(self.num_slots) if looks else 1
-        self._start = jax.jit(self._begin)
-        self._drive = jax.jit(self._drive_some)
+        num_devices = self.devices.shard.count
+        num_cores = acting_cores(self.num_slots) if looks and num_devices == 1 else 1
+        self._num_parts = num_devices * num_cores
+        self._slots_of_part = -(-self.num_slots // self._num_parts)
+        self._calls = np.split(np.arange(self._num_parts, dtype=np.int32), num_cores)  # the parts that each drives
+        self._start = self.devices.share(jax.jit(self._begin), (EVERYWHERE, BY_ENV), BY_ENV)
+        given, ended = (EVERYWHERE, BY_ENV, EVERYWHERE, EVERYWHERE, EVERYWHERE), (BY_ENV, BY_TIME_AND_ENV)
+        self._drive = self.devices.share(jax.jit(self._drive_some), given, ended)
 
     def run(
         self,
@@ -83,26 +98,26 @@ class Evaluator:
         def drive(step: int, slots: Slots) -> tuple[Slots, dict[str, Array]]:
             return jax.block_until_ready(self._drive(params, slots, stream, number, jnp.int32(step)))
 
-        slots = tuple(self._start(stream, jnp.int32(core)) for core in range(self._num_cores))
+        slots = tuple(self._start(stream, parts) for parts in self._calls)
         found: dict[int, dict[str, np.ndarray]] = {}
         step = 0
-        with ThreadPoolExecutor(self._num_cores, "segvisrl-driving") as pool:
+        with ThreadPoolExecutor(len(self._calls), "segvisrl-driving") as pool:
             while len(found) < episodes:
                 slots, ended = zip(*pool.map(functools.partial(drive, step), slots), strict=True)
-                for of_core in jax.device_get(ended):
-                    _collect(of_core, found)
+                for of_call in self.devices.gather(ended):
+                    _collect(of_call, found)
                 on_progress(len(found))
                 step += 1
         rows = [found[i] for i in range(episodes)]
         return Finished(**{name: np.stack([row[name] for row in rows]) for name in rows[0]})
 
-    def _begin(self, stream: PRNGKeyArray, core: Int32[Array, ""]) -> Slots:
-        num_slots = self.num_slots // self._num_cores
-        episode = core + self._num_cores * jnp.arange(num_slots, dtype=jnp.int32)
+    def _begin(self, stream: PRNGKeyArray, part: Int32[Array, "1"]) -> Slots:
+        num_slots = self._slots_of_part
+        episode = part + self._num_parts * jnp.arange(num_slots, dtype=jnp.int32)
         return Slots(
             rover=self._scenes(stream, episode),
             episode=episode,
-            next_episode=core + self._num_cores * num_slots,
+            next_episode=part + self._num_parts * num_slots,
             is_first=jnp.ones(num_slots, jnp.float32),
             carry=self.policy.initial_carry(num_slots),
         )
@@ -130,13 +145,13 @@ class Evaluator:
 
     def _refill(self, stream: PRNGKeyArray, done: Bool[Array, "S"], slots: Slots) -> Slots:
         """Slots whose episode ended take the next numbers."""
-        following = slots.next_episode + self._num_cores * (jnp.cumsum(done, dtype=jnp.int32) - 1)
+        following = slots.next_episode + self._num_parts * (jnp.cumsum(done, dtype=jnp.int32) - 1)
         episode = jnp.where(done, following, slots.episode)
         return dataclasses.replace(
             slots,
             rover=select(done, self._scenes(stream, episode), slots.rover),
             episode=episode,
-            next_episode=slots.next_episode + self._num_cores * jnp.sum(done, dtype=jnp.int32),
+            next_episode=slots.next_episode + self._num_parts * jnp.sum(done, dtype=jnp.int32),
             is_first=done.astype(jnp.float32),
         )
 

@@ -77,7 +77,8 @@ class Trainer:
         self.cores = Cores(acting_cores(config.ppo.num_envs) if on_host else 1)
         self.batch = BatchEnv(env, config.ppo.num_envs // shard.count // self.cores.count)
         self.policy: Policy = network_policy(self.network, config.arch)
-        self.evaluator = Evaluator(RoverEnv(validation_env(config)), self.policy, config.evaluation.num_slots)
+        held_out = RoverEnv(validation_env(config))
+        self.evaluator = Evaluator(held_out, self.policy, config.evaluation.num_slots, self.devices)
         self._lay_out = self.devices.lay_out(lambda key: key, EVERYWHERE)
         self._split = self.devices.lay_out(lambda key: tuple(jax.random.split(key)), EVERYWHERE)
         self._init = self.devices.lay_out(self.learner.init, EVERYWHERE)
@@ -128,7 +129,12 @@ class Trainer:
         return TrainingState(learner, self._begin(act_key), self._lay_out(update_key))
 
     def update(self, state: TrainingState) -> tuple[TrainingState, dict[str, Any], EpisodeLog]:
-        """One rollout and one learning update; the log as NumPy arrays."""
+        """One rollout and one learning update; the log as NumPy arrays.
+
+        The programs are queued one behind the other, so that a device does not wait between them. None is given its
+        buffers to write in: a late stop saves the state from before (``_Session.end_late``), and nothing else is as
+        large as something that comes out. It would spare 41 MB at 192 x 108, of the learner.
+        """
         next_key, key = self._split(state.update_key)
         actor, trajectory, last_value, log = self.act(state)
         learner, metrics = self._learn(state.learner, trajectory, last_value, key)
@@ -141,7 +147,7 @@ class Trainer:
     def evaluate(self, params: Any, seed: int) -> dict[str, Any]:
         """A policy on the validation scenes of a seed."""
         stream = scene_stream(seed, VALIDATION_STREAM)
-        finished = self.evaluator.run(self.devices.on_one(params), stream, self.config.evaluation.episodes)
+        finished = self.evaluator.run(params, stream, self.config.evaluation.episodes)
         return summarize(finished, self.evaluator.env)
 
     def _unroll_batch(self, shard: Shard, learner: LearnerState, actor: ActorState):

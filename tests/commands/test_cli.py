@@ -66,6 +66,7 @@ def segvisrl(*words, cwd):
         (["bench", "render", "--batches", "0"], ["--batches", "0"]),
         (["bench", "render", "--json", "no/such/folder/x.json"], ["--json", "folder that exists"]),
         (["bench", "render", "--plot", "x.png"], ["--plot", "x.png", "growth"]),
+        (["bench", "train", "--trace", "x"], ["--trace", "x", "profile"]),
         (["bench", "growth", "--plot", "x.pdf"], ["--plot", "x.pdf", ".png"]),
         (["bench", "growth", "--growth.most-gib", "0"], ["most-gib", "0", "above 0"]),
         (["bench", "growth", "--growth.scales", "900"], ["scale", "900", "at least 4 pixels"]),
@@ -194,22 +195,28 @@ def test_demo_writes_a_gif_of_the_shipped_policy_where_asked(tmp_path):
 @pytest.mark.slow
 def test_bench_says_how_much_of_the_machine_learning_uses(tmp_path):
     words = ["--scale", "120", "--repeats", "1", "--preset", "smoke", "--json", "b.json"]
-    done = segvisrl("bench", "policy", "update", *words, cwd=tmp_path)
+    done = segvisrl("bench", "policy", "update", "train", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    limits, policy, update = [], [], []
-    for row in json.loads((tmp_path / "b.json").read_text())["rows"]:
-        is_limit = row["name"] == "matrix product"
-        (limits if is_limit else policy if row["part"] == "policy" else update).append(row)
+    rows = json.loads((tmp_path / "b.json").read_text())["rows"]
+    limits = [row for row in rows if row["name"] == "matrix product"]
+    policy, update, training = (
+        [row for row in rows if row["part"] == part and row not in limits] for part in ("policy", "update", "train")
+    )
     assert [row["batch"] for row in policy] == [1, 4]
     parts = ["convolutions, forward", "memory, heads, loss", "convolutions, backward"]
     assert [row["phase"] for row in update] == ["all", *parts]
-    for row in policy + update:
+    for row in policy + update + training:
         assert 0 < row["percent_of_matrix_product"] < 100
+        assert 0.1 < row["memory_gib"] < 16
     whole, forward, _, backward = update
     assert forward["mflop_each"] > 1  # convolutions, which are no operations of XLA, count too
     assert 3 * forward["mflop_each"] < whole["mflop_each"]
     assert backward["mflop_each"] == 2 * forward["mflop_each"]
-    assert len(limits) == 2
+    num_epochs = preset_config("cnn_lstm", "smoke").ppo.num_epochs
+    for row in training:  # an image is looked at once, and learnt from in every epoch
+        assert row["mflop_each"] == pytest.approx((1 / 3 + num_epochs) * whole["mflop_each"])
+    assert [row["observations"] for row in training] == ["kept", "drawn again"]
+    assert len(limits) == 3
 
 
 def test_bench_prints_a_table_and_writes_the_same_numbers(tmp_path):
@@ -230,10 +237,18 @@ def test_bench_prints_a_table_and_writes_the_same_numbers(tmp_path):
     done = segvisrl(*words, "--renderers", "scanline", "--repeats", "1", "--json", "b.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "b.json").read_text())
-    assert [(row["part"], row["name"], row["batch"]) for row in result["rows"]] == [
+    copies, measured = ([row for row in result["rows"] if (row["name"] == "copy") is c] for c in (True, False))
+    assert [(row["part"], row["name"], row["batch"]) for row in measured] == [
         ("physics", "native", 2), ("render", "scanline", 1), ("render", "scanline", 3),
     ]  # fmt: skip
-    assert all(row.get("frames_per_s", row.get("decisions_per_s")) > 0 for row in result["rows"])
+    assert [row["part"] for row in copies] == ["physics", "render"]
+    for row in measured:
+        assert row.get("frames_per_s", row.get("decisions_per_s")) > 0
+        assert 0 < row["percent_of_copy"] < 100
+        assert 0.1 < row["memory_gib"] < 16
+    physics, one, _ = measured
+    assert physics["gbyte_per_s"] == pytest.approx(2 * 4 * (11 + 10) * physics["mujoco_steps_per_s"] / 1e9)
+    assert one["gbyte_per_s"] == pytest.approx(16 * 9 * 3 * one["frames_per_s"] / 1e9)
     assert done.stdout.count("| scanline | 1920 x 1080 to 16 x 9 | 4 |") == 2
     assert result["command"].startswith("segvisrl bench physics render")
     assert result["machine"]["cores"] == num_cores()

@@ -31,13 +31,35 @@ from segvisrl_jax.training.loop import train
 for run in " ".join(sys.argv[1:]).split(" ; "):
     train(parse_config(run.split()))
 """
+DRIVE = """
+import jax
+import numpy as np
+import segvisrl_jax
+from segvisrl_jax.cpu import make_callbacks_safe
+make_callbacks_safe()
+from segvisrl_jax.env.wrappers import TEST_STREAM, scene_stream
+from segvisrl_jax.training.devices import Devices
+from segvisrl_jax.training.evaluation import Evaluator
+from segvisrl_jax.training.policy import p_controller
+env, stream = segvisrl_jax.make_env(obs="state", physics="native"), scene_stream(0, TEST_STREAM)
+one, several = (Evaluator(env, p_controller(), 10, Devices(count)) for count in (1, 8))
+slots = several._start(stream, *several._calls)
+assert sorted(slots.episode.tolist()) == list(range(16))
+assert [len(shard.data) for shard in slots.episode.addressable_shards] == [2] * 8
+jax.tree.map(np.testing.assert_array_equal, one.run((), stream, 21), several.run((), stream, 21))
+print("driven")
+"""
 
 
 def train(*runs):
     """One run after the other, each with options of its own, where JAX sees eight devices; what is said."""
-    environment = os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {SIMULATE}={NUM_DEVICES}"}
     words = " ; ".join(" ".join(" ".join(pair) for pair in (TINY | run).items()) for run in runs)
-    command = [sys.executable, "-c", PROGRAM, *words.split()]
+    return on_eight_devices(PROGRAM, *words.split())
+
+
+def on_eight_devices(program, *words):
+    environment = os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {SIMULATE}={NUM_DEVICES}"}
+    command = [sys.executable, "-c", program, *words]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S)
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
@@ -74,6 +96,11 @@ def test_eight_devices_train_as_one_does(arch, tmp_path):
     eight = {"--arch": arch, "--runs-dir": str(tmp_path / "eight"), "--num-devices": "8"}
     train(one, eight)
     assert_same_run(tmp_path / "one", tmp_path / "eight")
+
+
+@pytest.mark.slow
+def test_eight_devices_drive_the_held_out_episodes_of_one():
+    assert on_eight_devices(DRIVE) == "driven\n"
 
 
 @pytest.mark.slow
