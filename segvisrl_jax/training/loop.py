@@ -33,6 +33,7 @@ from segvisrl_jax.training.rollout import ActorState, EpisodeLog, start_acting, 
 from segvisrl_jax.training.run import HostState, Run, open_run_dirs, open_runs
 from segvisrl_jax.training.stop_signals import StopSignals
 from segvisrl_jax.training.trackers import require_installed
+from segvisrl_jax.vision.renderer import InGraphRenderer
 
 
 @struct.dataclass
@@ -182,7 +183,8 @@ def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | N
 
     Raises:
         ConfigError: where the run folder exists and is not to be resumed, or cannot be; where the policy to start from
-            is of another architecture, or sees something else; where a logger is not installed or cannot be opened.
+            is of another architecture, or sees something else; where a logger is not installed or cannot be opened;
+            where this machine lacks what the settings ask for.
         DivergedError: where a loss or gradient was not finite in each of ``max_bad_updates`` updates in a row.
     """
     say = functools.partial(_tell, say)
@@ -190,6 +192,7 @@ def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | N
     processes = join(config)
     processes.together(lambda: require_installed(config.loggers))
     first_params = None if config.resume else processes.together(lambda: _params_to_start_from(config))
+    trainer = processes.together(lambda: _trainer_that_can_see(config))  # refused before anything is made
     processes.on_first(lambda: open_run_dirs(config))
     go_on = f"{Path(config.runs_dir) / config.runs[0].run_name} has its last checkpoint: start all again with --resume"
     with contextlib.ExitStack() as stack, processes.giving_up(go_on):
@@ -197,7 +200,7 @@ def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | N
         runs = open_runs(config, processes, say if processes.is_first else _say_nothing)
         for run in runs:
             stack.callback(run.close)
-        session = _Session(config, runs, processes)
+        session = _Session(trainer, runs, processes)
         late = functools.partial(session.end_late, when_late) if when_late and processes.count == 1 else None
         with StopSignals(late=late) as stop:
             finished = session.drive(stop, first_params)
@@ -216,6 +219,15 @@ def _say_nothing(line: str) -> None:
     """Of the processes beside the first one."""
 
 
+def _trainer_that_can_see(config: TrainConfig) -> Trainer:
+    """Opens what its renderer draws with: OpenGL, which may be missing, is opened where drawing is first traced."""
+    trainer = Trainer(config)
+    env = trainer.evaluator.env
+    if env.renderer is not None and not isinstance(env.renderer, InGraphRenderer):
+        jax.eval_shape(lambda: env.observe(env.initial_state(jax.random.key(config.seed))))
+    return trainer
+
+
 def _params_to_start_from(config: TrainConfig) -> Params | None:
     if not config.start_from:
         return None
@@ -232,10 +244,8 @@ def _params_to_start_from(config: TrainConfig) -> Params | None:
 class _Session:
     """One sitting of the runs that a trainer trains."""
 
-    trainer: Trainer
-
-    def __init__(self, config: TrainConfig, runs: Sequence[Run], processes: Processes) -> None:
-        self.config, self.runs, self.processes = config, runs, processes
+    def __init__(self, trainer: Trainer, runs: Sequence[Run], processes: Processes) -> None:
+        self.trainer, self.config, self.runs, self.processes = trainer, trainer.config, runs, processes
         self._saving = threading.Lock()
         self._whole: tuple[TrainingState, list[HostState]] | None = None  # after the last update that is written down
         self._bad_updates = 0  # in a row
@@ -244,7 +254,6 @@ class _Session:
     def drive(self, stop: StopSignals, first_params: Params | None) -> bool:
         """Updates until the end or a signal, and saves; whether it is the end."""
         config = self.config
-        self.trainer = Trainer(config)
         state = self._start(first_params)
         self.num_to_be_saved = self.runs[0].num_saved
         for run in self.runs:

@@ -145,6 +145,21 @@ def test_a_policy_that_does_not_fit_is_refused_before_anything_is_made(field, me
     assert not (tmp_path / "second").exists()
 
 
+@pytest.mark.parametrize(
+    ("arch", "field", "message"),
+    [
+        ("mlp", {"num_envs": 8192, "num_devices": 4096}, "num_devices = 4096: should be at most"),
+        ("cnn", {"renderer": "gl"}, "MUJOCO_GL = 'off'"),
+    ],
+)
+def test_what_this_machine_lacks_is_refused_before_anything_is_made(arch, field, message, tmp_path, monkeypatch):
+    """Else the folder would be in the way of the same run with settings that can be had."""
+    monkeypatch.setenv("MUJOCO_GL", "off")
+    with pytest.raises(ConfigError, match=message):
+        loop.train(tiny(arch, tmp_path, updates=1, run="run", **field), **QUIET)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_run_leaves_its_files(config, tmp_path):
     assert json.loads((tmp_path / "run" / "config.json").read_text())["ppo"]["num_envs"] == 4
     lines = read_metrics(tmp_path / "run")
