@@ -65,6 +65,9 @@ def run(options: Sequence[str]) -> int:
     if not result.finished:
         print(f"Stopped and saved after {result.decisions:,} decisions. {going_on}")
         return INTERRUPTED
+    if result.told_to_stop:
+        print(_without_products(config))
+        return INTERRUPTED
     return _leave_products(config, result.run_dirs)
 
 
@@ -221,12 +224,17 @@ def _draw_together(config: TrainConfig, run_dirs: Sequence[Path]) -> None:
     print(f"All seeds: {draw_learning_curves(read_curves(run_dirs), _together(config))}")
 
 
+def _without_products(config: TrainConfig) -> str:
+    """What is said where a training that is over is stopped."""
+    made_with = f"Its evaluation, curve and video are made with:\n  {resume_command(config)}"
+    return f"The training is complete and saved. {made_with}"
+
+
 def _leave_products(config: TrainConfig, run_dirs: Sequence[Path]) -> int:
     """What is made of finished runs; gives the exit code. What fails or is stopped here costs no training."""
     from segvisrl_jax.training.stop_signals import StopSignals
 
-    again = resume_command(config)
-    told = f"The training is complete and saved. Its evaluation, curve and video are made with:\n  {again}"
+    again, told = resume_command(config), _without_products(config)
     missing: list[str] = []
     with StopSignals(grace_s=0.0, late=lambda at_once: _end_now(told)):
         for each, run_dir in zip(config.runs, run_dirs, strict=True):

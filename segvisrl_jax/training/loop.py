@@ -51,6 +51,7 @@ class TrainResult:
 
     run_dirs: tuple[Path, ...]  # one for each seed
     finished: bool  # False where a signal ended it early
+    told_to_stop: bool  # by a signal, which may have come when nothing was left to do
     not_on_disk: tuple[str, ...]  # what could not be written; empty unless a disk or folder failed
     decisions: int  # that are saved
 
@@ -206,7 +207,7 @@ def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | N
             finished = session.drive(stop, first_params)
         missing = tuple(f"{run.folder}: {what}" for run in runs for what in run.not_on_disk(session.num_to_be_saved))
     decisions = (runs[0].num_saved or 0) * config.ppo.decisions_per_update
-    return TrainResult(tuple(run.folder for run in runs), finished, missing, decisions)
+    return TrainResult(tuple(run.folder for run in runs), finished, stop.requested, missing, decisions)
 
 
 def _tell(say: Callable[[str], object], line: str) -> None:
