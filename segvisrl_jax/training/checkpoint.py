@@ -91,6 +91,24 @@ class Checkpoints:
         """Whether there is none any more."""
         return self.latest is None and (self._run_dir / MARK).exists()
 
+    def whole(self) -> set[int]:
+        """Updates behind those that are as they were written."""
+        return {step for step in self._manager.all_steps() if self._complaint(self._folder / str(step)) is None}
+
+    def go_back_to(self, updates: int) -> None:
+        """Removes later ones; with 0, all, as if none had been written.
+
+        Raises:
+            OSError: where one cannot be removed.
+        """
+        later = sorted((step for step in self._manager.all_steps() if step > updates), reverse=True)
+        self._manager.close()
+        if updates == 0:
+            (self._run_dir / MARK).unlink(missing_ok=True)
+        for step in later:
+            shutil.rmtree(self._folder / str(step))
+        self._manager = self._open()
+
     def _mark(self) -> None:
         mark = self._run_dir / MARK
         with contextlib.suppress(OSError):  # the checkpoint is written, and worth more

@@ -282,19 +282,28 @@ class _Session:
     def _start(self, first_params: Params | None) -> TrainingState:
         if not self.config.resume:
             return self.trainer.start(first_params)
-        begun = [run.num_saved is not None for run in self.runs]
-        if not any(begun):
+        if len({run.num_saved for run in self.runs}) > 1:
+            self._go_back_together()
+        if self.runs[0].num_saved is None:
             for run in self.runs:
                 run.require_nothing_lost()
             self.runs[0].say("nothing was saved yet: starting at the beginning")
             return self.trainer.start(_params_to_start_from(self.config))
-        require(all(begun), "num_seeds", len(self.runs), "1, for each run by itself: not all of them have a checkpoint")
         state = self.trainer.start()
-        restored = [run.restore(self.trainer.of_seed(state, i)) for i, run in enumerate(self.runs)]
-        reached = [run.host.updates for run in self.runs]
-        same = len(set(reached)) == 1
-        require(same, "num_seeds", len(self.runs), f"1, for each run by itself: they have made {reached} updates")
-        return self.trainer.of_seeds(restored)
+        return self.trainer.of_seeds([run.restore(self.trainer.of_seed(state, i)) for i, run in enumerate(self.runs)])
+
+    def _go_back_together(self) -> None:
+        """Leaves every seed with the newest checkpoint that all have: one that is killed has written some and not all.
+
+        Raises:
+            ConfigError: where there is none: some went on by themselves, or one could not write for long.
+        """
+        common = set.intersection(*(run.can_go_on_from() for run in self.runs))
+        reached = [run.num_saved or 0 for run in self.runs]
+        should = f"1, for each run by itself: they have made {reached} updates"
+        require(bool(common), "num_seeds", len(self.runs), should)
+        for run in self.runs:
+            run.go_back_to(max(common))
 
     def end_late(self, end: Callable[[str], object], at_once: bool) -> None:
         """In the watching thread: saves the state before the update that takes too long, and ends the process."""

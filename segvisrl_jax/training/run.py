@@ -111,6 +111,24 @@ class Run:
                 "again under another --run"
             )
 
+    def can_go_on_from(self) -> set[int]:
+        """Updates behind its whole checkpoints, and 0 where beginning again costs no more than one of them.
+
+        Raises:
+            ConfigError: where its checkpoints are lost.
+        """
+        self.require_nothing_lost()
+        has_only_begun = (self.num_saved or 0) <= self.config.checkpoint_every_updates
+        return self._checkpoints.whole() | ({0} if has_only_begun else set())
+
+    def go_back_to(self, updates: int) -> None:
+        """Removes what was saved after ``updates``: it is made again."""
+        if (self.num_saved or 0) == updates:
+            return
+        self.say(f"{self.folder}: goes back from update {self.num_saved} to {updates}, where all seeds were saved")
+        self._checkpoints.go_back_to(updates)
+        self.num_saved = self._checkpoints.latest
+
     def _find_policy(self) -> None:
         """Reads the best policy, to put it back if it vanishes; a later one takes its place where it is not there."""
         if not self.host.best:
