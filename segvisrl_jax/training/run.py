@@ -134,7 +134,8 @@ class Run:
         if not self.host.best:
             return
         try:
-            _, params, scores = load_policy(self.folder / "policy")
+            source, params, scores = load_policy(self.folder / "policy")
+            require_policy_of(self.folder, source)
             self._policy, self._best_on_disk = (params, scores), _rank(scores)
         except (ConfigError, KeyError, TypeError) as error:
             self.say(f"warning: the best policy so far is not there ({one_line(error)}); the next one is kept")
@@ -375,6 +376,22 @@ def _require_same_run(config: TrainConfig, then: dict[str, Any], run_dir: Path) 
     for name, value in now.items():
         if name not in FREE_ON_RESUME and value != then.get(name):
             raise ConfigError(f"{name} = {value!r}: should be {then.get(name)!r}, as when {run_dir} was started")
+
+
+def require_policy_of(run_dir: Path, trained: TrainConfig) -> None:
+    """Checks that the policy in a run's folder was trained with the run's settings, where those can be read.
+
+    Raises:
+        ConfigError: where it is another run's.
+    """
+    try:
+        then = flatten(to_dict(TrainConfig())) | flatten(read_json(run_dir / "config.json"))
+    except (OSError, ValueError, TypeError, AttributeError):
+        return
+    try:
+        _require_same_run(trained, then | {"start_from": trained.start_from}, run_dir)  # a policy names no folders
+    except ConfigError as error:
+        raise ConfigError(f"{run_dir / 'policy' / 'policy.json'}: is another run's policy ({error})") from None
 
 
 def _rank(scores: dict[str, Any]) -> list[float]:
