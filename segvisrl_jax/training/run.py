@@ -337,10 +337,11 @@ def open_run_dir(config: TrainConfig) -> Path:
         if _holds_something(run_dir):
             raise taken
         try:
-            run_dir.mkdir(parents=True, exist_ok=run_dir.exists())
-            _write_settings(run_dir, config)
-        except FileExistsError:  # another process was faster
-            raise taken from None
+            run_dir.mkdir(parents=True, exist_ok=True)
+            with contextlib.closing(RunLock(run_dir)):  # two may have come at once, and seen nothing there
+                if _holds_something(run_dir):
+                    raise taken
+                _write_settings(run_dir, config)
         except OSError as error:
             raise _cannot_be_written(run_dir, error) from None
         return run_dir
