@@ -18,7 +18,7 @@ from segvisrl_jax.agent.networks import Params
 from segvisrl_jax.config import BOOKKEEPING, ConfigError, TrainConfig, flatten, one_line, read_json, to_dict
 from segvisrl_jax.training.checkpoint import Checkpoints, load_policy, save_policy
 from segvisrl_jax.training.manifest import replace_file
-from segvisrl_jax.training.metrics import MetricsWriter
+from segvisrl_jax.training.metrics import METRICS_FILE, MetricsWriter, read_metrics
 from segvisrl_jax.training.processes import Processes
 from segvisrl_jax.training.rollout import EpisodeLog
 from segvisrl_jax.training.run_lock import RunLock, is_being_trained
@@ -29,6 +29,7 @@ RECENT_EPISODES = 200  # what the progress bar's shares are taken over
 # Not evaluation.rocks and evaluation.episodes: the best policy so far was judged by them.
 FREE_ON_RESUME = (*BOOKKEEPING, "steps", "preset", "evaluation.every_decisions", "evaluation.num_slots")
 OUTCOMES = (Outcome.SUCCESS, Outcome.COLLISION, Outcome.FALL, Outcome.TIMEOUT, Outcome.UNSTABLE)
+SECONDS = "time/seconds"  # the number that tells how long a run has trained
 PATIENCE_S = 3.0  # with another thread that writes the policy
 OURS = ("lock",)  # what may be in a folder that no run has begun in, besides half-written files
 
@@ -145,6 +146,15 @@ class Run:
         """Drops the numbers of updates that are going to be made again."""
         if self._writer:
             self._writer.resume_at(self.decisions)
+            self._tell_wrong_numbers()
+
+    def _tell_wrong_numbers(self) -> None:
+        """Says where lines so far are missing, or another run's: a checkpoint knows the time in its last line."""
+        rows, updates = read_metrics(self.folder), self.host.updates
+        if len(rows) < updates:
+            self.say(f"warning: {METRICS_FILE}: {updates - len(rows)} of {updates} lines are missing; the run goes on")
+        elif rows and rows[-1].get(SECONDS, self.host.seconds) != self.host.seconds:
+            self.say(f"warning: {METRICS_FILE}: its lines are not those of this run's checkpoint; the run goes on")
 
     def count(self, metrics: dict[str, Any], log: EpisodeLog, seconds: float) -> dict[str, float]:
         """Counts one update, and gives its row of numbers."""
@@ -155,7 +165,7 @@ class Run:
         self.host.updates += 1
         self.host.seconds += seconds
         speed = self.config.ppo.decisions_per_update / seconds
-        times = {"time/seconds": self.host.seconds, "time/decisions_per_second": speed}
+        times = {SECONDS: self.host.seconds, "time/decisions_per_second": speed}
         return _row(metrics, log, self._recent) | times | {"episode/num_unstable": float(self.host.unstable)}
 
     def judge(self, summary: dict[str, Any], params: Params) -> dict[str, float]:

@@ -194,12 +194,13 @@ def test_damaged_settings_end_in_one_line_and_move_nothing(kind, runs, tmp_path,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", DAMAGES)
-def test_damaged_metrics_do_not_stop_a_run(kind, runs, tmp_path):
-    run = tmp_path / "run"
+def test_damaged_metrics_are_named_and_do_not_stop_a_run(kind, runs, tmp_path):
+    run, said = tmp_path / "run", []
     shutil.copytree(runs / "run", run)
     damage(run, runs / "other", "metrics.jsonl", kind)
-    result = loop.train(settings(tmp_path, run="run", resume=True, steps=128), **QUIET)
+    result = loop.train(settings(tmp_path, run="run", resume=True, steps=128), say=said.append)
     assert result.finished
+    assert any("warning: metrics.jsonl: " in line for line in said) or kind.endswith("flipped"), said
     assert [row["step"] for row in read_metrics(run)][-1] == 128
 
 

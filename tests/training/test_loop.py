@@ -72,8 +72,10 @@ def test_stopping_and_going_on_changes_no_bit(arch, tmp_path):
     stopped = stop_after(first, updates=2)
     assert not stopped.finished
     assert stopped.decisions == 64
-    resumed = loop.train(replace_fields(first, resume=True), **QUIET)
+    said = []
+    resumed = loop.train(replace_fields(first, resume=True), say=said.append)
     assert resumed.finished
+    assert said == ["going on from update 2 of 4"]
 
     (state, host), (other, other_host) = final_state(whole), final_state(first)
     for a, b in zip(as_arrays(state), as_arrays(other), strict=True):
