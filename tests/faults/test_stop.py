@@ -10,6 +10,7 @@ import sys
 import termios
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -231,6 +232,17 @@ def test_handlers_are_put_back(tmp_path):
     with StopSignals(late=lambda at_once: None) as stop:
         assert not stop.requested
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_another_thread_than_the_main_one_trains_without_signals():
+    """As studies of several trials do: Python refuses to set handlers there."""
+
+    def train_there():
+        with StopSignals(late=lambda at_once: None) as stop:
+            return stop.requested
+
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(train_there).result() is False
 
 
 def test_a_signal_that_is_answered_in_time_is_not_late():
