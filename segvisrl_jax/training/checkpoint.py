@@ -161,7 +161,7 @@ class Checkpoints:
     def _keep_whole_ones(self) -> None:
         """Leaves the newest whole checkpoint as the newest one."""
         found = sorted(
-            (path for path in self._folder.glob("*") if path.name.isdigit()), key=lambda path: -int(path.name)
+            (path for path in self._folder.glob("*") if path.name.isdecimal()), key=lambda path: -int(path.name)
         )
         if found and not any((path / MANIFEST).exists() for path in found):
             self._say(f"{self._folder}: the checkpoints have no checksums, as those of earlier versions")

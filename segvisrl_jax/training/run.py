@@ -331,7 +331,8 @@ def _open_run(config: TrainConfig, processes: Processes, say: Callable[[str], No
 
 
 def _cannot_be_written(run_dir: Path, error: OSError) -> ConfigError:
-    return ConfigError(f"run = {str(run_dir)!r}: cannot be written ({error.strerror or error})")
+    place = f"{error.filename}: " if error.filename else ""
+    return ConfigError(f"run = {str(run_dir)!r}: cannot be written ({place}{error.strerror or error})")
 
 
 def open_run_dir(config: TrainConfig) -> Path:

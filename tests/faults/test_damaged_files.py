@@ -205,6 +205,17 @@ def test_damaged_metrics_are_named_and_do_not_stop_a_run(kind, runs, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["metrics.jsonl", "lock"])
+def test_what_is_in_the_way_of_a_file_is_named(name, runs, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(runs / "run", run)
+    (run / name).unlink()
+    (run / name).mkdir()
+    with pytest.raises(ConfigError, match=rf"cannot be written \({run}/{name}: Is a directory\)"):
+        loop.train(settings(tmp_path, run="run", resume=True, steps=128), **QUIET)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["cnn_lstm", "cnn", "cnn_lstm_raw", "mlp", "mlp_rocks"])
 def test_a_damaged_policy_is_refused_and_its_file_named(name, tmp_path):
     shipped = asset_dir("pretrained") / name

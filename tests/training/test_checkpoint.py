@@ -43,6 +43,16 @@ def test_an_older_state_is_not_written_over_a_newer_one(tmp_path):
     checkpoints.close()
 
 
+def test_what_is_no_checkpoint_is_left_alone(tmp_path):
+    """Among them what Python takes for digits, and not for a number."""
+    for name in ("notes", "²"):
+        (tmp_path / "checkpoints" / name).mkdir(parents=True)
+    checkpoints = Checkpoints(tmp_path)
+    assert checkpoints.latest is None
+    checkpoints.close()
+    assert {path.name for path in (tmp_path / "checkpoints").iterdir()} == {"notes", "²"}
+
+
 def test_a_checkpoint_stays_where_its_mark_cannot_be_written(tmp_path):
     (tmp_path / MARK).symlink_to(tmp_path / "nowhere" / "mark")
     checkpoints = Checkpoints(tmp_path)
