@@ -252,6 +252,7 @@ def _finish(config: TrainConfig, run_dir: Path) -> list[str]:
     """Test scenes, learning curve, video, and what to type next; gives what could not be made, and why."""
     from segvisrl_jax.commands import demo
     from segvisrl_jax.report.figures import learning_curve
+    from segvisrl_jax.training.metrics import output_may_fail
 
     curve, video = run_dir / "learning_curve.png", run_dir / "rollout.mp4"
     made: dict[Path, Callable[[], object]] = {
@@ -260,11 +261,12 @@ def _finish(config: TrainConfig, run_dir: Path) -> list[str]:
         video: lambda: demo.record(demo.DemoOptions(run=run_dir, output=video)),
     }
     failed = _not_made(made)
-    for path in (run_dir / "config.json", run_dir / "metrics.jsonl", *made, run_dir / "policy"):
-        if path not in failed:
-            print(f"  {path}{os.sep if path.is_dir() else ''}")
     named = shlex.quote(str(run_dir))
-    print(f"Next: segvisrl eval --run {named} --episodes 1000    or    segvisrl demo --run {named} --scene 1")
+    with output_may_fail():  # other seeds may wait for theirs
+        for path in (run_dir / "config.json", run_dir / "metrics.jsonl", *made, run_dir / "policy"):
+            if path not in failed:
+                print(f"  {path}{os.sep if path.is_dir() else ''}")
+        print(f"Next: segvisrl eval --run {named} --episodes 1000    or    segvisrl demo --run {named} --scene 1")
     return list(failed.values())
 
 

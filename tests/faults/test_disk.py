@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 from segvisrl_jax import cli
 from segvisrl_jax.commands import eval as eval_command
+from segvisrl_jax.commands import train
 from segvisrl_jax.config import (
     ConfigError,
     NotWrittenError,
@@ -319,6 +320,18 @@ def test_a_log_on_a_full_disk_costs_no_training(tmp_path):
     assert (done.returncode, done.stderr) == (1, "segvisrl train: No space left on device\n")
     assert newest_checkpoint(tmp_path) == 2
     assert all((tmp_path / "run" / name).stat().st_size for name in PRODUCTS)
+
+
+def test_the_products_of_every_seed_are_made_where_output_fails(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(train, "_not_made", lambda products: made.extend(products) or {})
+    config = settings(tmp_path, num_seeds=2)
+    full = io.TextIOWrapper(Path("/dev/full").open("wb", buffering=0), line_buffering=True)  # noqa: SIM115
+    with contextlib.redirect_stdout(full):
+        assert train._leave_products(config, [tmp_path / run.run_name for run in config.runs]) == 0
+    with contextlib.suppress(OSError):
+        full.close()
+    assert {path.parent.name for path in made if path.name in PRODUCTS} == {"run-seed0", "run-seed1"}
 
 
 TRIAL = Trial("seed0", {"seed": "0"}, ())
