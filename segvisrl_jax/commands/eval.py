@@ -60,9 +60,11 @@ def run(options: Sequence[str]) -> int:
     if asked.json is not None:
         require_file_can_be_written(asked.json, "--json")
     result = evaluate(asked)
-    print(f"{result['method']}: {report_line(result)}")
-    if asked.json is not None:
-        write_output(asked.json, as_json(result))
+    try:
+        if asked.json is not None:
+            write_output(asked.json, as_json(result))
+    finally:  # the file may be on a full disk, or standard output, and the other not
+        print(f"{result['method']}: {report_line(result)}")
     return 0
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import os
 import shutil
 import subprocess
@@ -308,6 +309,16 @@ def test_an_evaluation_that_cannot_be_written_leaves_the_one_before(disk, capsys
     assert said == f"segvisrl eval: '{disk}/old.json': cannot be written (No space left on device)\n"
     assert (disk / "old.json").read_text() == "before"
     assert {path.name for path in disk.iterdir()} == {"old.json", "filler"}
+
+
+def test_a_log_on_a_full_disk_costs_no_evaluation(tmp_path):
+    words = ["eval", "--controller", "random", "--episodes", "2", "--slots", "2", "--json", str(tmp_path / "new.json")]
+    full = io.TextIOWrapper(Path("/dev/full").open("wb", buffering=0), line_buffering=True)  # noqa: SIM115
+    with contextlib.redirect_stdout(full):
+        assert cli.main(words) == 1
+    with contextlib.suppress(OSError):
+        full.close()
+    assert json.loads((tmp_path / "new.json").read_text())["episodes"] == 2
 
 
 @pytest.mark.slow
