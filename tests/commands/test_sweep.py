@@ -1,5 +1,6 @@
 """A sweep trains what is missing, leaves finished runs alone, and says what failed: here, and on a Ray cluster."""
 
+import contextlib
 import csv
 import io
 import json
@@ -112,6 +113,19 @@ def test_a_table_that_cannot_be_written_ends_no_sweep_before_its_end(tmp_path, m
     assert trained == ["seed0", "seed1"]
     said = capsys.readouterr().err
     assert said == "segvisrl sweep: 'sweep/results.csv': cannot be written (Is a directory)\n"
+
+
+def test_output_that_cannot_be_written_ends_no_sweep_before_its_end(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    trained = []
+    monkeypatch.setattr(engines, "train_in", lambda *asked: trained.append(asked[1].name) or finish(*asked))
+    full = io.TextIOWrapper(Path("/dev/full").open("wb", buffering=0), line_buffering=True)  # noqa: SIM115
+    with contextlib.redirect_stdout(full):
+        assert main(["sweep", *SMALL, "--vary", "seed=0,1"]) == 1
+    with contextlib.suppress(OSError):
+        full.close()
+    assert trained == ["seed0", "seed1"]
+    assert [row["status"] for row in read_rows(tmp_path)] == ["done", "done"]
 
 
 def num_updates(run):
