@@ -72,6 +72,7 @@ class Checkpoints:
         Raises:
             Exception: of many kinds where the disk is full or the folder is gone; those from before are still there.
         """
+        self._forget_removed_ones()
         if self.latest is not None and updates <= self.latest:
             return
         args = ocp.args.Composite(state=ocp.args.StandardSave(_stored(state)), host=ocp.args.JsonSave(host))
@@ -85,6 +86,12 @@ class Checkpoints:
             if self._processes.count == 1:
                 self._start_again(updates)
             raise
+
+    def _forget_removed_ones(self) -> None:
+        """Has the manager look again where somebody removed the newest: it counts what it has written itself."""
+        if self._processes.count == 1 and self.latest and not (self._folder / str(self.latest)).exists():
+            self._manager.close()
+            self._manager = self._open()
 
     @property
     def are_lost(self) -> bool:
