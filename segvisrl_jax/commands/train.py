@@ -60,7 +60,7 @@ def run(options: Sequence[str]) -> int:
     if not is_first:
         return 0 if result.finished else INTERRUPTED
     if result.not_on_disk:
-        print(f"segvisrl train: could not be written: {'; '.join(result.not_on_disk)}", file=sys.stderr)
+        print(f"segvisrl train: could not be written: {'; '.join(result.not_on_disk)}. {going_on}", file=sys.stderr)
         return FAILURE
     if not result.finished:
         print(f"Stopped and saved after {result.decisions:,} decisions. {going_on}")

@@ -145,6 +145,7 @@ def test_the_command_says_what_could_not_be_written(disk, during, capsys):
     assert code == 1
     assert "segvisrl train: could not be written: " in told.err
     assert "the checkpoint of update 4" in told.err
+    assert told.err.rstrip().endswith(f"Go on with:\n  segvisrl train --resume --runs-dir {disk} --run run")
     assert "Traceback" not in told.err + told.out
 
 
