@@ -16,8 +16,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from segvisrl_jax import cli
+from segvisrl_jax.commands import bench, train
 from segvisrl_jax.commands import eval as eval_command
-from segvisrl_jax.commands import train
 from segvisrl_jax.config import (
     ConfigError,
     NotWrittenError,
@@ -320,6 +320,16 @@ def test_a_log_on_a_full_disk_costs_no_evaluation(tmp_path):
     with contextlib.suppress(OSError):
         full.close()
     assert json.loads((tmp_path / "new.json").read_text())["episodes"] == 2
+
+
+def test_a_log_on_a_full_disk_costs_no_measurement(tmp_path, monkeypatch):
+    monkeypatch.setattr(bench, "_physics", lambda asked: [{"batch": 1}])
+    full = io.TextIOWrapper(Path("/dev/full").open("wb", buffering=0), line_buffering=True)  # noqa: SIM115
+    with contextlib.redirect_stdout(full):
+        assert cli.main(["bench", "physics", "--json", str(tmp_path / "new.json")]) == 1
+    with contextlib.suppress(OSError):
+        full.close()
+    assert json.loads((tmp_path / "new.json").read_text())["rows"] == [{"part": "physics", "batch": 1}]
 
 
 @pytest.mark.slow
