@@ -46,6 +46,7 @@ FAILURE = 1
 USAGE_ERROR = 2
 INTERRUPTED = 130
 BAD_PATH = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR, errno.EACCES)
+STANDARD_ERROR = 2  # the last of the three descriptors that a process is started with
 READER_GONE = 141  # what a shell gives for SIGPIPE: the output went to `head`, which had enough
 OptionsT = TypeVar("OptionsT")
 COMPLAINTS = {
@@ -72,6 +73,7 @@ ELSEWHERE = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The program. Returns its exit code: 0, 1 for a failure, 2 for a mistake in what was asked, 130 after Ctrl-C."""
+    _open_what_is_closed()
     words = list(sys.argv[1:] if argv is None else argv)
     if not words or words[0] in ("-h", "--help"):
         print(_usage())
@@ -156,6 +158,16 @@ def _end_of(command: str, error: OSError) -> int:
         return FAILURE
     _drop_output()  # it is standard output that cannot be written
     return FAILURE
+
+
+def _open_what_is_closed() -> None:
+    """Has output go nowhere that the process was started without: else files that it opens would take its place."""
+    while (nowhere := os.open(os.devnull, os.O_RDWR)) <= STANDARD_ERROR:
+        continue
+    os.close(nowhere)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
 
 
 def _drop_output() -> None:

@@ -112,19 +112,26 @@ def run(options: Sequence[str]) -> int:
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     before = machine()
     rows: list[dict[str, Any]] = []
+
+    def keep() -> None:
+        """After each part: a later one may fail, and the file or standard output, but not both."""
+        if asked.json is not None:
+            content = {"command": shlex.join(["segvisrl", "bench", *options]), "machine": before, "rows": rows}
+            write_output(asked.json, json.dumps(content, indent=2) + "\n")
+
     for part in asked.parts:
         measured = []
         for row in measure[part](asked):
             measured.append(row if part in ELSEWHERE else {**row, "memory_gib": peak_bytes() / GIB})
             print(f"{part}: rows measured: {len(measured)}", end="\r", file=sys.stderr, flush=True)
-        _print_table(part, measured)
         rows += [{"part": part, **row} for row in measured]
+        try:
+            keep()
+        finally:
+            _print_table(part, measured)
         if part == "growth":
             rows += _conclude_growth(asked, measured)
-        if asked.json is not None:  # after each part: a later one may fail
-            command = shlex.join(["segvisrl", "bench", *options])
-            content = {"command": command, "machine": before, "rows": rows}
-            write_output(asked.json, json.dumps(content, indent=2) + "\n")
+            keep()
     return 0
 
 

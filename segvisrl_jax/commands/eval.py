@@ -60,9 +60,11 @@ def run(options: Sequence[str]) -> int:
     if asked.json is not None:
         require_file_can_be_written(asked.json, "--json")
     result = evaluate(asked)
-    print(f"{result['method']}: {report_line(result)}")
-    if asked.json is not None:
-        write_output(asked.json, as_json(result))
+    try:
+        if asked.json is not None:
+            write_output(asked.json, as_json(result))
+    finally:  # the file may be on a full disk, or standard output, and the other not
+        print(f"{result['method']}: {report_line(result)}")
     return 0
 
 
@@ -181,10 +183,13 @@ def load_driver(run: Path | None, policy: str | None, controller: str | None) ->
     from segvisrl_jax.agent.networks import make_network
     from segvisrl_jax.env.rover_env import observation_shape
     from segvisrl_jax.training.checkpoint import load_policy
+    from segvisrl_jax.training.run import require_policy_of
 
     if run is not None and not (Path(run) / "policy" / "policy.json").is_file():
         raise ConfigError(f"--run = {str(run)!r}: should be a run's folder that holds a policy (policy/policy.json)")
     config, params, _ = load_policy(policy_folder(run, policy))
+    if run is not None:
+        require_policy_of(Path(run), config)
     network = make_network(config.arch, config.network, observation_shape(config.env))
     _require_parameters_that_fit(params, network, policy_folder(run, policy))
     return network_policy(network, config.arch), params, held_out(config)

@@ -104,18 +104,29 @@ def _train(
     trainings: "Trainings",
 ) -> None:
     """Runs the trials under a bar, with a line for each that ends."""
+    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from segvisrl_jax.training.metrics import output_may_fail
 
     if not missing:
         return
     columns = (TextColumn("sweep"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns) as progress:
-        bar = progress.add_task("sweep", total=len(missing))
-        counted = f"{len(missing)} run{'' if len(missing) == 1 else 's'}"
-        progress.console.print(f"{counted}; logs in {asked.output}", highlight=False)
+    progress = Progress(*columns, console=Console(highlight=False))
+    bar = progress.add_task("sweep", total=len(missing))
+
+    def show(do: Callable[..., object], *given: object) -> None:
+        with output_may_fail():  # trainings go on where nobody hears of them
+            do(*given)
+
+    show(progress.start)
+    try:
+        show(progress.console.print, f"{len(missing)} run{'' if len(missing) == 1 else 's'}; logs in {asked.output}")
         for trial, ended in _ends(asked, missing, trainings):
-            progress.console.print(f"  {note(trial, _status(asked, trial, ended), ended.node)}", highlight=False)
+            show(progress.console.print, f"  {note(trial, _status(asked, trial, ended), ended.node)}")
             progress.advance(bar)
+    finally:
+        show(progress.stop)
 
 
 def _ends(asked: SweepOptions, missing: "Sequence[Trial]", trainings: "Trainings") -> "Iterator[tuple[Trial, Ended]]":

@@ -60,10 +60,13 @@ def run(options: Sequence[str]) -> int:
     if not is_first:
         return 0 if result.finished else INTERRUPTED
     if result.not_on_disk:
-        print(f"segvisrl train: could not be written: {'; '.join(result.not_on_disk)}", file=sys.stderr)
+        print(f"segvisrl train: could not be written: {'; '.join(result.not_on_disk)}. {going_on}", file=sys.stderr)
         return FAILURE
     if not result.finished:
         print(f"Stopped and saved after {result.decisions:,} decisions. {going_on}")
+        return INTERRUPTED
+    if result.told_to_stop:
+        print(_without_products(config))
         return INTERRUPTED
     return _leave_products(config, result.run_dirs)
 
@@ -221,12 +224,17 @@ def _draw_together(config: TrainConfig, run_dirs: Sequence[Path]) -> None:
     print(f"All seeds: {draw_learning_curves(read_curves(run_dirs), _together(config))}")
 
 
+def _without_products(config: TrainConfig) -> str:
+    """What is said where a training that is over is stopped."""
+    made_with = f"Its evaluation, curve and video are made with:\n  {resume_command(config)}"
+    return f"The training is complete and saved. {made_with}"
+
+
 def _leave_products(config: TrainConfig, run_dirs: Sequence[Path]) -> int:
     """What is made of finished runs; gives the exit code. What fails or is stopped here costs no training."""
     from segvisrl_jax.training.stop_signals import StopSignals
 
-    again = resume_command(config)
-    told = f"The training is complete and saved. Its evaluation, curve and video are made with:\n  {again}"
+    again, told = resume_command(config), _without_products(config)
     missing: list[str] = []
     with StopSignals(grace_s=0.0, late=lambda at_once: _end_now(told)):
         for each, run_dir in zip(config.runs, run_dirs, strict=True):
@@ -244,6 +252,7 @@ def _finish(config: TrainConfig, run_dir: Path) -> list[str]:
     """Test scenes, learning curve, video, and what to type next; gives what could not be made, and why."""
     from segvisrl_jax.commands import demo
     from segvisrl_jax.report.figures import learning_curve
+    from segvisrl_jax.training.metrics import output_may_fail
 
     curve, video = run_dir / "learning_curve.png", run_dir / "rollout.mp4"
     made: dict[Path, Callable[[], object]] = {
@@ -252,11 +261,12 @@ def _finish(config: TrainConfig, run_dir: Path) -> list[str]:
         video: lambda: demo.record(demo.DemoOptions(run=run_dir, output=video)),
     }
     failed = _not_made(made)
-    for path in (run_dir / "config.json", run_dir / "metrics.jsonl", *made, run_dir / "policy"):
-        if path not in failed:
-            print(f"  {path}{os.sep if path.is_dir() else ''}")
     named = shlex.quote(str(run_dir))
-    print(f"Next: segvisrl eval --run {named} --episodes 1000    or    segvisrl demo --run {named} --scene 1")
+    with output_may_fail():  # other seeds may wait for theirs
+        for path in (run_dir / "config.json", run_dir / "metrics.jsonl", *made, run_dir / "policy"):
+            if path not in failed:
+                print(f"  {path}{os.sep if path.is_dir() else ''}")
+        print(f"Next: segvisrl eval --run {named} --episodes 1000    or    segvisrl demo --run {named} --scene 1")
     return list(failed.values())
 
 

@@ -46,8 +46,16 @@ def programs_folder(environment: MutableMapping[str, str] = os.environ) -> Path:
     """
     if environment.get(FOLDER_VARIABLE):
         return Path(environment[FOLDER_VARIABLE])
-    cache = environment.get("XDG_CACHE_HOME") or Path(environment.get("HOME") or Path.home()) / ".cache"
+    cache = environment.get("XDG_CACHE_HOME") or _home(environment) / ".cache"
     return Path(cache) / "segvisrl_jax" / f"programs-{_cpu_word()}"
+
+
+def _home(environment: MutableMapping[str, str]) -> Path:
+    """The user's; the root where there is none, as in a container whose user is a bare number."""
+    try:
+        return Path(environment.get("HOME") or Path.home())
+    except RuntimeError:
+        return Path("/")
 
 
 def _cpu_word() -> str:

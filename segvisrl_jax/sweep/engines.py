@@ -109,7 +109,8 @@ def run_ray(
     marker = output / MARKER
     marker.write_text(word)
     task = ray.remote(num_cpus=num_cpus, num_gpus=num_gpus)(train_on_node)
-    waiting = {task.remote(trial, str(output.resolve()), word, num_gpus): trial for trial in trials}
+    place = str(output.resolve())
+    waiting = {task.remote(trial, place, word, num_gpus, begun(output, trial)): trial for trial in trials}
     try:
         while waiting:
             [reference], _ = ray.wait(list(waiting), num_returns=1)
@@ -154,13 +155,25 @@ def _receive(ray: Any, reference: Any, output: Path) -> Ended:
     return ended
 
 
-def train_on_node(trial: Trial, output: str, word: str, num_gpus: float) -> tuple[Ended, bytes]:
-    """What a node of the cluster does: trains, and packs the run where it does not see the sweep's folder."""
+def begun(output: Path, trial: Trial) -> bytes:
+    """What there is of a trial's run, for a node that does not see it; empty where it has not begun."""
+    if not (output / trial.name / "config.json").is_file():
+        return b""
+    return pack(output, (trial.name, f"{trial.name}.log"))
+
+
+def train_on_node(trial: Trial, output: str, word: str, num_gpus: float, before: bytes = b"") -> tuple[Ended, bytes]:
+    """What a node of the cluster does: trains, and packs the run where it does not see the sweep's folder.
+
+    There it goes on with what is packed in ``before``.
+    """
     marker, environment = Path(output) / MARKER, sharing_a_gpu(num_gpus)
     node = _node_name()
     if marker.is_file() and marker.read_text() == word:
         return Ended(train_in(Path(output), trial, environment), node), b""
     with tempfile.TemporaryDirectory() as folder:
+        if before:
+            unpack(before, Path(folder))
         code = train_in(Path(folder), trial, environment)
         return Ended(code, node), pack(Path(folder))
 
@@ -172,11 +185,13 @@ def _node_name() -> str:
     return f"{ray.util.get_node_ip_address()}/{ray.get_runtime_context().get_node_id()[:8]}"
 
 
-def pack(folder: Path) -> bytes:
-    """A folder's contents as a compressed archive."""
+def pack(folder: Path, names: Sequence[str] = (".",)) -> bytes:
+    """A folder's contents, or what there is by these names in it, as a compressed archive."""
     packed = io.BytesIO()
     with tarfile.open(fileobj=packed, mode="w:gz") as archive:
-        archive.add(folder, arcname=".")
+        for name in names:
+            if (folder / name).exists():
+                archive.add(folder / name, arcname=name)
     return packed.getvalue()
 
 

@@ -72,6 +72,7 @@ class Checkpoints:
         Raises:
             Exception: of many kinds where the disk is full or the folder is gone; those from before are still there.
         """
+        self._forget_removed_ones()
         if self.latest is not None and updates <= self.latest:
             return
         args = ocp.args.Composite(state=ocp.args.StandardSave(_stored(state)), host=ocp.args.JsonSave(host))
@@ -86,10 +87,34 @@ class Checkpoints:
                 self._start_again(updates)
             raise
 
+    def _forget_removed_ones(self) -> None:
+        """Has the manager look again where somebody removed the newest: it counts what it has written itself."""
+        if self._processes.count == 1 and self.latest and not (self._folder / str(self.latest)).exists():
+            self._manager.close()
+            self._manager = self._open()
+
     @property
     def are_lost(self) -> bool:
         """Whether there is none any more."""
         return self.latest is None and (self._run_dir / MARK).exists()
+
+    def whole(self) -> set[int]:
+        """Updates behind those that are as they were written."""
+        return {step for step in self._manager.all_steps() if self._complaint(self._folder / str(step)) is None}
+
+    def go_back_to(self, updates: int) -> None:
+        """Removes later ones; with 0, all, as if none had been written.
+
+        Raises:
+            OSError: where one cannot be removed.
+        """
+        later = sorted((step for step in self._manager.all_steps() if step > updates), reverse=True)
+        self._manager.close()
+        if updates == 0:
+            (self._run_dir / MARK).unlink(missing_ok=True)
+        for step in later:
+            shutil.rmtree(self._folder / str(step))
+        self._manager = self._open()
 
     def _mark(self) -> None:
         mark = self._run_dir / MARK
@@ -143,7 +168,7 @@ class Checkpoints:
     def _keep_whole_ones(self) -> None:
         """Leaves the newest whole checkpoint as the newest one."""
         found = sorted(
-            (path for path in self._folder.glob("*") if path.name.isdigit()), key=lambda path: -int(path.name)
+            (path for path in self._folder.glob("*") if path.name.isdecimal()), key=lambda path: -int(path.name)
         )
         if found and not any((path / MANIFEST).exists() for path in found):
             self._say(f"{self._folder}: the checkpoints have no checksums, as those of earlier versions")

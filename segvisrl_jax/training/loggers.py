@@ -123,6 +123,7 @@ class TensorBoard:
         self._folder = Path(run_dir) / TENSORBOARD_FOLDER
         self._events: EventsWriter | None = None
         self._purge_step: int | None = None
+        self._number = 0  # of the file that is written
 
     def resume_at(self, step: int) -> None:
         """Tells TensorBoard to hide the events beyond ``step``."""
@@ -147,7 +148,15 @@ class TensorBoard:
             self._purge_step = None  # once: a later file of this sitting hides nothing of it
         except OSError:
             self._events = None  # what is half written ends this file; the next numbers go to a new one
+            self._remove_empty()
             raise
+
+    def _remove_empty(self) -> None:
+        """Removes the newest file where nothing is in it: a full disk would get one with every update."""
+        with contextlib.suppress(OSError):
+            for file in self._folder.glob(f"events.*.{self._number}"):
+                if file.stat().st_size == 0:
+                    file.unlink()
 
     def close(self) -> None:
         """See ``Logger``."""
@@ -161,8 +170,8 @@ class TensorBoard:
         from tensorboardX.proto.event_pb2 import Event, SessionLog
 
         self._folder.mkdir(parents=True, exist_ok=True)
-        number = len(list(self._folder.glob("events.*")))
-        events = EventsWriter(str(self._folder / "events"), f".{number}")
+        self._number = len(list(self._folder.glob("events.*")))
+        events = EventsWriter(str(self._folder / "events"), f".{self._number}")
         if self._purge_step is not None:
             began = SessionLog(status=SessionLog.START)
             events.write_event(Event(wall_time=time.time(), step=self._purge_step, session_log=began))

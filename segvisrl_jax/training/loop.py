@@ -33,6 +33,7 @@ from segvisrl_jax.training.rollout import ActorState, EpisodeLog, start_acting, 
 from segvisrl_jax.training.run import HostState, Run, open_run_dirs, open_runs
 from segvisrl_jax.training.stop_signals import StopSignals
 from segvisrl_jax.training.trackers import require_installed
+from segvisrl_jax.vision.renderer import InGraphRenderer
 
 
 @struct.dataclass
@@ -50,6 +51,7 @@ class TrainResult:
 
     run_dirs: tuple[Path, ...]  # one for each seed
     finished: bool  # False where a signal ended it early
+    told_to_stop: bool  # by a signal, which may have come when nothing was left to do
     not_on_disk: tuple[str, ...]  # what could not be written; empty unless a disk or folder failed
     decisions: int  # that are saved
 
@@ -188,7 +190,8 @@ def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | N
 
     Raises:
         ConfigError: where the run folder exists and is not to be resumed, or cannot be; where the policy to start from
-            is of another architecture, or sees something else; where a logger is not installed or cannot be opened.
+            is of another architecture, or sees something else; where a logger is not installed or cannot be opened;
+            where this machine lacks what the settings ask for.
         DivergedError: where a loss or gradient was not finite in each of ``max_bad_updates`` updates in a row.
     """
     say = functools.partial(_tell, say)
@@ -196,6 +199,7 @@ def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | N
     processes = join(config)
     processes.together(lambda: require_installed(config.loggers))
     first_params = None if config.resume else processes.together(lambda: _params_to_start_from(config))
+    trainer = processes.together(lambda: _trainer_that_can_see(config))  # refused before anything is made
     processes.on_first(lambda: open_run_dirs(config))
     go_on = f"{Path(config.runs_dir) / config.runs[0].run_name} has its last checkpoint: start all again with --resume"
     with contextlib.ExitStack() as stack, processes.giving_up(go_on):
@@ -203,13 +207,13 @@ def train(config: TrainConfig, say=print, when_late: Callable[[str], object] | N
         runs = open_runs(config, processes, say if processes.is_first else _say_nothing)
         for run in runs:
             stack.callback(run.close)
-        session = _Session(config, runs, processes)
+        session = _Session(trainer, runs, processes)
         late = functools.partial(session.end_late, when_late) if when_late and processes.count == 1 else None
         with StopSignals(late=late) as stop:
             finished = session.drive(stop, first_params)
         missing = tuple(f"{run.folder}: {what}" for run in runs for what in run.not_on_disk(session.num_to_be_saved))
     decisions = (runs[0].num_saved or 0) * config.ppo.decisions_per_update
-    return TrainResult(tuple(run.folder for run in runs), finished, missing, decisions)
+    return TrainResult(tuple(run.folder for run in runs), finished, stop.requested, missing, decisions)
 
 
 def _tell(say: Callable[[str], object], line: str) -> None:
@@ -220,6 +224,15 @@ def _tell(say: Callable[[str], object], line: str) -> None:
 
 def _say_nothing(line: str) -> None:
     """Of the processes beside the first one."""
+
+
+def _trainer_that_can_see(config: TrainConfig) -> Trainer:
+    """Opens what its renderer draws with: OpenGL, which may be missing, is opened where drawing is first traced."""
+    trainer = Trainer(config)
+    env = trainer.evaluator.env
+    if env.renderer is not None and not isinstance(env.renderer, InGraphRenderer):
+        jax.eval_shape(lambda: env.observe(env.initial_state(jax.random.key(config.seed))))
+    return trainer
 
 
 def _params_to_start_from(config: TrainConfig) -> Params | None:
@@ -238,10 +251,8 @@ def _params_to_start_from(config: TrainConfig) -> Params | None:
 class _Session:
     """One sitting of the runs that a trainer trains."""
 
-    trainer: Trainer
-
-    def __init__(self, config: TrainConfig, runs: Sequence[Run], processes: Processes) -> None:
-        self.config, self.runs, self.processes = config, runs, processes
+    def __init__(self, trainer: Trainer, runs: Sequence[Run], processes: Processes) -> None:
+        self.trainer, self.config, self.runs, self.processes = trainer, trainer.config, runs, processes
         self._saving = threading.Lock()
         self._whole: tuple[TrainingState, list[HostState]] | None = None  # after the last update that is written down
         self._bad_updates = 0  # in a row
@@ -250,7 +261,6 @@ class _Session:
     def drive(self, stop: StopSignals, first_params: Params | None) -> bool:
         """Updates until the end or a signal, and saves; whether it is the end."""
         config = self.config
-        self.trainer = Trainer(config)
         state = self._start(first_params)
         self.num_to_be_saved = self.runs[0].num_saved
         for run in self.runs:
@@ -278,19 +288,28 @@ class _Session:
     def _start(self, first_params: Params | None) -> TrainingState:
         if not self.config.resume:
             return self.trainer.start(first_params)
-        begun = [run.num_saved is not None for run in self.runs]
-        if not any(begun):
+        if len({run.num_saved for run in self.runs}) > 1:
+            self._go_back_together()
+        if self.runs[0].num_saved is None:
             for run in self.runs:
                 run.require_nothing_lost()
             self.runs[0].say("nothing was saved yet: starting at the beginning")
             return self.trainer.start(_params_to_start_from(self.config))
-        require(all(begun), "num_seeds", len(self.runs), "1, for each run by itself: not all of them have a checkpoint")
         state = self.trainer.start()
-        restored = [run.restore(self.trainer.of_seed(state, i)) for i, run in enumerate(self.runs)]
-        reached = [run.host.updates for run in self.runs]
-        same = len(set(reached)) == 1
-        require(same, "num_seeds", len(self.runs), f"1, for each run by itself: they have made {reached} updates")
-        return self.trainer.of_seeds(restored)
+        return self.trainer.of_seeds([run.restore(self.trainer.of_seed(state, i)) for i, run in enumerate(self.runs)])
+
+    def _go_back_together(self) -> None:
+        """Leaves every seed with the newest checkpoint that all have: one that is killed has written some and not all.
+
+        Raises:
+            ConfigError: where there is none: some went on by themselves, or one could not write for long.
+        """
+        common = set.intersection(*(run.can_go_on_from() for run in self.runs))
+        reached = [run.num_saved or 0 for run in self.runs]
+        should = f"1, for each run by itself: they have made {reached} updates"
+        require(bool(common), "num_seeds", len(self.runs), should)
+        for run in self.runs:
+            run.go_back_to(max(common))
 
     def end_late(self, end: Callable[[str], object], at_once: bool) -> None:
         """In the watching thread: saves the state before the update that takes too long, and ends the process."""

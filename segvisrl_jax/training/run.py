@@ -18,7 +18,7 @@ from segvisrl_jax.agent.networks import Params
 from segvisrl_jax.config import BOOKKEEPING, ConfigError, TrainConfig, flatten, one_line, read_json, to_dict
 from segvisrl_jax.training.checkpoint import Checkpoints, load_policy, save_policy
 from segvisrl_jax.training.manifest import replace_file
-from segvisrl_jax.training.metrics import MetricsWriter
+from segvisrl_jax.training.metrics import METRICS_FILE, MetricsWriter, read_metrics
 from segvisrl_jax.training.processes import Processes
 from segvisrl_jax.training.rollout import EpisodeLog
 from segvisrl_jax.training.run_lock import RunLock, is_being_trained
@@ -29,6 +29,7 @@ RECENT_EPISODES = 200  # what the progress bar's shares are taken over
 # Not evaluation.rocks and evaluation.episodes: the best policy so far was judged by them.
 FREE_ON_RESUME = (*BOOKKEEPING, "steps", "preset", "evaluation.every_decisions", "evaluation.num_slots")
 OUTCOMES = (Outcome.SUCCESS, Outcome.COLLISION, Outcome.FALL, Outcome.TIMEOUT, Outcome.UNSTABLE)
+SECONDS = "time/seconds"  # the number that tells how long a run has trained
 PATIENCE_S = 3.0  # with another thread that writes the policy
 OURS = ("lock",)  # what may be in a folder that no run has begun in, besides half-written files
 
@@ -111,12 +112,31 @@ class Run:
                 "again under another --run"
             )
 
+    def can_go_on_from(self) -> set[int]:
+        """Updates behind its whole checkpoints, and 0 where beginning again costs no more than one of them.
+
+        Raises:
+            ConfigError: where its checkpoints are lost.
+        """
+        self.require_nothing_lost()
+        has_only_begun = (self.num_saved or 0) <= self.config.checkpoint_every_updates
+        return self._checkpoints.whole() | ({0} if has_only_begun else set())
+
+    def go_back_to(self, updates: int) -> None:
+        """Removes what was saved after ``updates``: it is made again."""
+        if (self.num_saved or 0) == updates:
+            return
+        self.say(f"{self.folder}: goes back from update {self.num_saved} to {updates}, where all seeds were saved")
+        self._checkpoints.go_back_to(updates)
+        self.num_saved = self._checkpoints.latest
+
     def _find_policy(self) -> None:
         """Reads the best policy, to put it back if it vanishes; a later one takes its place where it is not there."""
         if not self.host.best:
             return
         try:
-            _, params, scores = load_policy(self.folder / "policy")
+            source, params, scores = load_policy(self.folder / "policy")
+            require_policy_of(self.folder, source)
             self._policy, self._best_on_disk = (params, scores), _rank(scores)
         except (ConfigError, KeyError, TypeError) as error:
             self.say(f"warning: the best policy so far is not there ({one_line(error)}); the next one is kept")
@@ -126,6 +146,15 @@ class Run:
         """Drops the numbers of updates that are going to be made again."""
         if self._writer:
             self._writer.resume_at(self.decisions)
+            self._tell_wrong_numbers()
+
+    def _tell_wrong_numbers(self) -> None:
+        """Says where lines so far are missing, or another run's: a checkpoint knows the time in its last line."""
+        rows, updates = read_metrics(self.folder), self.host.updates
+        if len(rows) < updates:
+            self.say(f"warning: {METRICS_FILE}: {updates - len(rows)} of {updates} lines are missing; the run goes on")
+        elif rows and rows[-1].get(SECONDS, self.host.seconds) != self.host.seconds:
+            self.say(f"warning: {METRICS_FILE}: its lines are not those of this run's checkpoint; the run goes on")
 
     def count(self, metrics: dict[str, Any], log: EpisodeLog, seconds: float) -> dict[str, float]:
         """Counts one update, and gives its row of numbers."""
@@ -136,7 +165,7 @@ class Run:
         self.host.updates += 1
         self.host.seconds += seconds
         speed = self.config.ppo.decisions_per_update / seconds
-        times = {"time/seconds": self.host.seconds, "time/decisions_per_second": speed}
+        times = {SECONDS: self.host.seconds, "time/decisions_per_second": speed}
         return _row(metrics, log, self._recent) | times | {"episode/num_unstable": float(self.host.unstable)}
 
     def judge(self, summary: dict[str, Any], params: Params) -> dict[str, float]:
@@ -302,7 +331,8 @@ def _open_run(config: TrainConfig, processes: Processes, say: Callable[[str], No
 
 
 def _cannot_be_written(run_dir: Path, error: OSError) -> ConfigError:
-    return ConfigError(f"run = {str(run_dir)!r}: cannot be written ({error.strerror or error})")
+    place = f"{error.filename}: " if error.filename else ""
+    return ConfigError(f"run = {str(run_dir)!r}: cannot be written ({place}{error.strerror or error})")
 
 
 def open_run_dir(config: TrainConfig) -> Path:
@@ -318,10 +348,11 @@ def open_run_dir(config: TrainConfig) -> Path:
         if _holds_something(run_dir):
             raise taken
         try:
-            run_dir.mkdir(parents=True, exist_ok=run_dir.exists())
-            _write_settings(run_dir, config)
-        except FileExistsError:  # another process was faster
-            raise taken from None
+            run_dir.mkdir(parents=True, exist_ok=True)
+            with contextlib.closing(RunLock(run_dir)):  # two may have come at once, and seen nothing there
+                if _holds_something(run_dir):
+                    raise taken
+                _write_settings(run_dir, config)
         except OSError as error:
             raise _cannot_be_written(run_dir, error) from None
         return run_dir
@@ -357,6 +388,22 @@ def _require_same_run(config: TrainConfig, then: dict[str, Any], run_dir: Path) 
     for name, value in now.items():
         if name not in FREE_ON_RESUME and value != then.get(name):
             raise ConfigError(f"{name} = {value!r}: should be {then.get(name)!r}, as when {run_dir} was started")
+
+
+def require_policy_of(run_dir: Path, trained: TrainConfig) -> None:
+    """Checks that the policy in a run's folder was trained with the run's settings, where those can be read.
+
+    Raises:
+        ConfigError: where it is another run's.
+    """
+    try:
+        then = flatten(to_dict(TrainConfig())) | flatten(read_json(run_dir / "config.json"))
+    except (OSError, ValueError, TypeError, AttributeError):
+        return
+    try:
+        _require_same_run(trained, then | {"start_from": trained.start_from}, run_dir)  # a policy names no folders
+    except ConfigError as error:
+        raise ConfigError(f"{run_dir / 'policy' / 'policy.json'}: is another run's policy ({error})") from None
 
 
 def _rank(scores: dict[str, Any]) -> list[float]:

@@ -23,13 +23,21 @@ def stop_signals() -> tuple[int, ...]:
 
 @contextlib.contextmanager
 def handlers_for(hear: Callable[[int, Any], object]) -> Iterator[None]:
-    """Has every stop signal call a function, and puts what was there before back."""
+    """Has every stop signal call a function, and puts what was there before back; nothing outside the main thread."""
+    if not _hears_signals():
+        yield
+        return
     before = {number: signal.signal(number, hear) for number in stop_signals()}
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _hears_signals() -> bool:
+    """Python hears signals in the main thread alone, and says how they are answered only there."""
+    return threading.current_thread() is threading.main_thread()
 
 
 def leave_closed_terminal() -> None:
@@ -67,7 +75,7 @@ class StopSignals:
         self._watcher: threading.Thread | None = None
 
     def __enter__(self) -> "StopSignals":
-        if self._late is not None:
+        if self._late is not None and _hears_signals():
             self._watch()
         self._handlers.__enter__()
         return self

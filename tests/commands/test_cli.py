@@ -142,6 +142,15 @@ def test_the_programs_own_errors_keep_their_traceback(error, monkeypatch):
         main(["doctor"])
 
 
+def test_output_that_was_closed_before_the_start_costs_nothing(tmp_path):
+    """As services are started. No file may be taken for it: what libraries print would be written into that."""
+    script = "import sys; from segvisrl_jax.cli import main; code = main(['runs', sys.argv[1]])\n"
+    script += "with open(sys.argv[0]) as opened_later: sys.exit(code if opened_later.fileno() > 2 else 3)"
+    (tmp_path / "script.py").write_text(script)
+    command = [sys.executable, str(tmp_path / "script.py"), str(tmp_path)]
+    assert subprocess.run(command, preexec_fn=lambda: os.closerange(0, 3)).returncode == 0
+
+
 def test_output_onto_a_full_disk_ends_in_one_line(tmp_path):
     command = [sys.executable, "-m", "segvisrl_jax.cli", "runs", str(tmp_path)]
     with Path("/dev/full").open("w") as full:

@@ -1,5 +1,6 @@
 """A sweep trains what is missing, leaves finished runs alone, and says what failed: here, and on a Ray cluster."""
 
+import contextlib
 import csv
 import io
 import json
@@ -15,7 +16,7 @@ import pytest
 
 from segvisrl_jax.cli import main
 from segvisrl_jax.sweep import engines
-from segvisrl_jax.sweep.engines import pack, sharing_a_gpu, train_on_node, unpack
+from segvisrl_jax.sweep.engines import begun, pack, sharing_a_gpu, train_on_node, unpack
 from segvisrl_jax.sweep.plan import parse_axis, plan_trials
 from segvisrl_jax.training.metrics import read_metrics
 from segvisrl_jax.training.run_lock import is_being_trained
@@ -114,6 +115,19 @@ def test_a_table_that_cannot_be_written_ends_no_sweep_before_its_end(tmp_path, m
     assert said == "segvisrl sweep: 'sweep/results.csv': cannot be written (Is a directory)\n"
 
 
+def test_output_that_cannot_be_written_ends_no_sweep_before_its_end(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    trained = []
+    monkeypatch.setattr(engines, "train_in", lambda *asked: trained.append(asked[1].name) or finish(*asked))
+    full = io.TextIOWrapper(Path("/dev/full").open("wb", buffering=0), line_buffering=True)  # noqa: SIM115
+    with contextlib.redirect_stdout(full):
+        assert main(["sweep", *SMALL, "--vary", "seed=0,1"]) == 1
+    with contextlib.suppress(OSError):
+        full.close()
+    assert trained == ["seed0", "seed1"]
+    assert [row["status"] for row in read_rows(tmp_path)] == ["done", "done"]
+
+
 def num_updates(run):
     return len(read_metrics(run)) if (run / "metrics.jsonl").exists() else 0
 
@@ -184,6 +198,29 @@ def test_packed_folders_come_back_whole_and_stay_inside(tmp_path):
     with pytest.raises(tarfile.OutsideDestinationError):
         unpack(made.getvalue(), target)
     assert not (tmp_path / "outside").exists()
+
+
+def test_a_node_that_does_not_see_a_run_goes_on_with_what_there_is(tmp_path, monkeypatch):
+    [trial, other] = plan_trials([parse_axis("seed=0,1")], [])
+    (tmp_path / "seed0" / "checkpoints" / "8").mkdir(parents=True)
+    (tmp_path / "seed0" / "config.json").write_text("{}")
+    (tmp_path / "seed0.log").write_text("before\n")
+
+    def train(folder, trial, environment):
+        assert (folder / "seed0" / "checkpoints" / "8").is_dir()
+        (folder / "seed0" / "checkpoints" / "16").mkdir()
+        with (folder / "seed0.log").open("a") as log:
+            log.write("after\n")
+        return 0
+
+    monkeypatch.setattr(engines, "train_in", train)
+    monkeypatch.setattr(engines, "_node_name", lambda: "node")
+    ended, packed = train_on_node(trial, "/no/such/folder", "word", 0.0, begun(tmp_path, trial))
+    unpack(packed, tmp_path)
+    assert ended == (0, "node", "")
+    assert {path.name for path in (tmp_path / "seed0" / "checkpoints").iterdir()} == {"8", "16"}
+    assert (tmp_path / "seed0.log").read_text() == "before\nafter\n"
+    assert begun(tmp_path, other) == b""
 
 
 def test_what_is_on_or_off_can_be_varied():

@@ -18,7 +18,7 @@ from segvisrl_jax import cli
 from segvisrl_jax.assets import asset_dir
 from segvisrl_jax.config import ConfigError, preset_config, replace_fields
 from segvisrl_jax.training import loop
-from segvisrl_jax.training.checkpoint import DAMAGED_FOLDER, Checkpoints, load_policy
+from segvisrl_jax.training.checkpoint import DAMAGED_FOLDER, Checkpoints, load_policy, save_policy
 from segvisrl_jax.training.manifest import sha256_of_json
 from segvisrl_jax.training.metrics import read_metrics
 
@@ -194,13 +194,25 @@ def test_damaged_settings_end_in_one_line_and_move_nothing(kind, runs, tmp_path,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", DAMAGES)
-def test_damaged_metrics_do_not_stop_a_run(kind, runs, tmp_path):
-    run = tmp_path / "run"
+def test_damaged_metrics_are_named_and_do_not_stop_a_run(kind, runs, tmp_path):
+    run, said = tmp_path / "run", []
     shutil.copytree(runs / "run", run)
     damage(run, runs / "other", "metrics.jsonl", kind)
-    result = loop.train(settings(tmp_path, run="run", resume=True, steps=128), **QUIET)
+    result = loop.train(settings(tmp_path, run="run", resume=True, steps=128), say=said.append)
     assert result.finished
+    assert any("warning: metrics.jsonl: " in line for line in said) or kind.endswith("flipped"), said
     assert [row["step"] for row in read_metrics(run)][-1] == 128
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["metrics.jsonl", "lock"])
+def test_what_is_in_the_way_of_a_file_is_named(name, runs, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(runs / "run", run)
+    (run / name).unlink()
+    (run / name).mkdir()
+    with pytest.raises(ConfigError, match=rf"cannot be written \({run}/{name}: Is a directory\)"):
+        loop.train(settings(tmp_path, run="run", resume=True, steps=128), **QUIET)
 
 
 @pytest.mark.slow
@@ -233,3 +245,17 @@ def test_a_damaged_policy_ends_a_command_in_one_line(tmp_path, capsys):
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "policy.json" in said
+
+
+def test_the_policy_of_another_run_is_not_taken_for_one_of_this(runs, tmp_path, capsys):
+    """Each file of it is whole; with the best of scores, it would stay the run's best policy."""
+    shutil.copytree(runs / "run", tmp_path / "run")
+    source, params, scores = load_policy(runs / "other" / "policy")
+    save_policy(tmp_path / "run" / "policy", source, params, {**scores, "success": 1.0})
+    assert cli.main(["eval", "--run", str(tmp_path / "run"), "--episodes", "2"]) == cli.USAGE_ERROR
+    refused = f"{tmp_path}/run/policy/policy.json: is another run's policy (seed = 1: should be 0"
+    assert refused in capsys.readouterr().err
+    said = []
+    loop.train(settings(tmp_path, run="run", resume=True, steps=128), say=said.append)
+    assert any(refused in line for line in said)
+    assert load_policy(tmp_path / "run" / "policy")[0].seed == 0

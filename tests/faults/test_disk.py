@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import os
 import shutil
 import subprocess
@@ -15,6 +16,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from segvisrl_jax import cli
+from segvisrl_jax.commands import bench, train
 from segvisrl_jax.commands import eval as eval_command
 from segvisrl_jax.config import (
     ConfigError,
@@ -143,6 +145,7 @@ def test_the_command_says_what_could_not_be_written(disk, during, capsys):
     assert code == 1
     assert "segvisrl train: could not be written: " in told.err
     assert "the checkpoint of update 4" in told.err
+    assert told.err.rstrip().endswith(f"Go on with:\n  segvisrl train --resume --runs-dir {disk} --run run")
     assert "Traceback" not in told.err + told.out
 
 
@@ -309,6 +312,26 @@ def test_an_evaluation_that_cannot_be_written_leaves_the_one_before(disk, capsys
     assert {path.name for path in disk.iterdir()} == {"old.json", "filler"}
 
 
+def test_a_log_on_a_full_disk_costs_no_evaluation(tmp_path):
+    words = ["eval", "--controller", "random", "--episodes", "2", "--slots", "2", "--json", str(tmp_path / "new.json")]
+    full = io.TextIOWrapper(Path("/dev/full").open("wb", buffering=0), line_buffering=True)  # noqa: SIM115
+    with contextlib.redirect_stdout(full):
+        assert cli.main(words) == 1
+    with contextlib.suppress(OSError):
+        full.close()
+    assert json.loads((tmp_path / "new.json").read_text())["episodes"] == 2
+
+
+def test_a_log_on_a_full_disk_costs_no_measurement(tmp_path, monkeypatch):
+    monkeypatch.setattr(bench, "_physics", lambda asked: [{"batch": 1}])
+    full = io.TextIOWrapper(Path("/dev/full").open("wb", buffering=0), line_buffering=True)  # noqa: SIM115
+    with contextlib.redirect_stdout(full):
+        assert cli.main(["bench", "physics", "--json", str(tmp_path / "new.json")]) == 1
+    with contextlib.suppress(OSError):
+        full.close()
+    assert json.loads((tmp_path / "new.json").read_text())["rows"] == [{"part": "physics", "batch": 1}]
+
+
 @pytest.mark.slow
 def test_a_log_on_a_full_disk_costs_no_training(tmp_path):
     words = ["train", "--arch", "mlp", "--preset", "smoke", "--runs-dir", str(tmp_path), "--run", "run", *WORDS]
@@ -319,6 +342,18 @@ def test_a_log_on_a_full_disk_costs_no_training(tmp_path):
     assert (done.returncode, done.stderr) == (1, "segvisrl train: No space left on device\n")
     assert newest_checkpoint(tmp_path) == 2
     assert all((tmp_path / "run" / name).stat().st_size for name in PRODUCTS)
+
+
+def test_the_products_of_every_seed_are_made_where_output_fails(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(train, "_not_made", lambda products: made.extend(products) or {})
+    config = settings(tmp_path, num_seeds=2)
+    full = io.TextIOWrapper(Path("/dev/full").open("wb", buffering=0), line_buffering=True)  # noqa: SIM115
+    with contextlib.redirect_stdout(full):
+        assert train._leave_products(config, [tmp_path / run.run_name for run in config.runs]) == 0
+    with contextlib.suppress(OSError):
+        full.close()
+    assert {path.parent.name for path in made if path.name in PRODUCTS} == {"run-seed0", "run-seed1"}
 
 
 TRIAL = Trial("seed0", {"seed": "0"}, ())

@@ -10,9 +10,13 @@ import sys
 import termios
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from segvisrl_jax.cli import INTERRUPTED
+from segvisrl_jax.commands import train
+from segvisrl_jax.training import loop
 from segvisrl_jax.training.loggers import read_metrics
 from segvisrl_jax.training.run_lock import is_being_trained
 from segvisrl_jax.training.stop_signals import GRACE_S, StopSignals
@@ -122,6 +126,25 @@ def test_after_the_last_update_the_training_is_complete(number, tmp_path):
     assert not (training.run / "rollout.mp4").exists()
 
 
+def test_a_signal_during_the_last_update_is_heard(tmp_path, monkeypatch, capsys):
+    """What would be made of the finished run takes longer than a machine that is being taken away grants."""
+    evaluate = loop.Trainer.evaluate
+
+    def evaluate_and_be_told(trainer, params, seed):
+        signal.raise_signal(signal.SIGTERM)
+        return evaluate(trainer, params, seed)
+
+    monkeypatch.setattr(loop.Trainer, "evaluate", evaluate_and_be_told)
+    smallest = ("--steps", "128", "--evaluation.episodes", "4", "--env.task.max-decisions", "12")
+    place = ("--runs-dir", str(tmp_path), "--run", "run")
+    assert train.run(["--arch", "mlp", "--preset", "smoke", *smallest, *place]) == INTERRUPTED
+    said = capsys.readouterr().out
+    assert "The training is complete and saved. Its evaluation, curve and video are made with:\n" in said
+    assert said.rstrip().endswith(f"segvisrl train --resume --runs-dir {tmp_path} --run run")
+    assert (tmp_path / "run" / "checkpoints" / "1" / "manifest.json").exists()
+    assert not (tmp_path / "run" / "eval.json").exists()
+
+
 class OnTerminal(Training):
     """A training on a terminal of its own."""
 
@@ -209,6 +232,17 @@ def test_handlers_are_put_back(tmp_path):
     with StopSignals(late=lambda at_once: None) as stop:
         assert not stop.requested
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_another_thread_than_the_main_one_trains_without_signals():
+    """As studies of several trials do: Python refuses to set handlers there."""
+
+    def train_there():
+        with StopSignals(late=lambda at_once: None) as stop:
+            return stop.requested
+
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(train_there).result() is False
 
 
 def test_a_signal_that_is_answered_in_time_is_not_late():

@@ -12,7 +12,7 @@ import time
 import pytest
 
 from segvisrl_jax.config import ConfigError, preset_config, replace_fields
-from segvisrl_jax.training import loop
+from segvisrl_jax.training import loop, run
 from segvisrl_jax.training.run_lock import RunLock, is_being_trained
 
 PATIENCE_S = 300.0
@@ -73,6 +73,22 @@ def test_a_folder_that_was_removed_is_taken_again(tmp_path):
 def small(tmp_path, **more):
     few = {"num_envs": 4, "unroll_length": 8, "num_minibatches": 2, "mlp_sizes": (8, 8), "steps": 256}
     return replace_fields(preset_config("mlp", "smoke"), runs_dir=str(tmp_path), run="run", **few | more)
+
+
+def test_of_two_that_begin_at_once_one_is_refused(tmp_path, monkeypatch):
+    """The second comes when the first has looked, made the folder, and not yet written its settings there."""
+    write_settings, others = run._write_settings, [small(tmp_path, seed=5)]
+
+    def write_beside_another(folder, config):
+        for other in (others.pop() for _ in others.copy()):
+            with pytest.raises(ConfigError, match="another process is training it"):
+                loop.open_run_dirs(other)
+        write_settings(folder, config)
+
+    monkeypatch.setattr(run, "_write_settings", write_beside_another)
+    loop.open_run_dirs(small(tmp_path))
+    assert not others
+    assert '"seed": 0' in (tmp_path / "run" / "config.json").read_text()
 
 
 @pytest.fixture

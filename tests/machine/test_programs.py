@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -37,6 +38,15 @@ def test_nothing_is_kept_where_nothing_can_be_written(tmp_path):
     environment = {"XDG_CACHE_HOME": str(tmp_path / "file")}
     keep_compiled_programs(environment)
     assert FOLDER not in environment
+
+
+def test_a_user_without_a_home_keeps_none(monkeypatch):
+    monkeypatch.setattr(Path, "home", MagicMock(side_effect=RuntimeError("Could not determine home directory.")))
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    monkeypatch.setattr(Path, "mkdir", MagicMock())
+    environment = {}
+    keep_compiled_programs(environment)
+    assert environment == {}
 
 
 def test_the_doctor_says_where_it_is(tmp_path, monkeypatch):

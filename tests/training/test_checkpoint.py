@@ -1,6 +1,7 @@
 """Checkpoints and policies come back bit by bit; what is damaged is named."""
 
 import json
+import shutil
 import threading
 
 import jax
@@ -41,6 +42,28 @@ def test_an_older_state_is_not_written_over_a_newer_one(tmp_path):
     assert checkpoints.latest == 2
     assert checkpoints.restore_latest(state())[1] == {"updates": 2}
     checkpoints.close()
+
+
+def test_a_checkpoint_that_was_removed_is_written_again(tmp_path):
+    """Also of the same update, as when a training is stopped before the next one ends."""
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, state(), {"updates": 1})
+    shutil.rmtree(tmp_path / "checkpoints")
+    checkpoints.save(1, state(), {"updates": 1})
+    checkpoints.close()
+    again = Checkpoints(tmp_path)
+    assert again.restore_latest(state())[1] == {"updates": 1}
+    again.close()
+
+
+def test_what_is_no_checkpoint_is_left_alone(tmp_path):
+    """Among them what Python takes for digits, and not for a number."""
+    for name in ("notes", "²"):
+        (tmp_path / "checkpoints" / name).mkdir(parents=True)
+    checkpoints = Checkpoints(tmp_path)
+    assert checkpoints.latest is None
+    checkpoints.close()
+    assert {path.name for path in (tmp_path / "checkpoints").iterdir()} == {"notes", "²"}
 
 
 def test_a_checkpoint_stays_where_its_mark_cannot_be_written(tmp_path):

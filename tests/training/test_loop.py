@@ -72,8 +72,10 @@ def test_stopping_and_going_on_changes_no_bit(arch, tmp_path):
     stopped = stop_after(first, updates=2)
     assert not stopped.finished
     assert stopped.decisions == 64
-    resumed = loop.train(replace_fields(first, resume=True), **QUIET)
+    said = []
+    resumed = loop.train(replace_fields(first, resume=True), say=said.append)
     assert resumed.finished
+    assert said == ["going on from update 2 of 4"]
 
     (state, host), (other, other_host) = final_state(whole), final_state(first)
     for a, b in zip(as_arrays(state), as_arrays(other), strict=True):
@@ -143,6 +145,21 @@ def test_a_policy_that_does_not_fit_is_refused_before_anything_is_made(field, me
     with pytest.raises(ConfigError, match=message):
         loop.train(more, **QUIET)
     assert not (tmp_path / "second").exists()
+
+
+@pytest.mark.parametrize(
+    ("arch", "field", "message"),
+    [
+        ("mlp", {"num_envs": 8192, "num_devices": 4096}, "num_devices = 4096: should be at most"),
+        ("cnn", {"renderer": "gl"}, "MUJOCO_GL = 'off'"),
+    ],
+)
+def test_what_this_machine_lacks_is_refused_before_anything_is_made(arch, field, message, tmp_path, monkeypatch):
+    """Else the folder would be in the way of the same run with settings that can be had."""
+    monkeypatch.setenv("MUJOCO_GL", "off")
+    with pytest.raises(ConfigError, match=message):
+        loop.train(tiny(arch, tmp_path, updates=1, run="run", **field), **QUIET)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_run_leaves_its_files(config, tmp_path):

@@ -14,6 +14,7 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboardX.event_file_writer import EventsWriter
 
+from segvisrl_jax.training.loggers import TensorBoard
 from segvisrl_jax.training.metrics import MetricsWriter, ProgressDisplay, read_metrics
 
 
@@ -104,6 +105,19 @@ def test_a_file_that_vanished_is_whole_again_or_not_there(tmp_path, size_limit):
     assert len(said) == 2
     assert "cannot be written" in said[0]
     assert said[1] == "metrics.jsonl is written again"
+
+
+def test_a_disk_that_is_full_for_long_gets_no_empty_event_files(tmp_path, size_limit):
+    board = TensorBoard(tmp_path)
+    size_limit(0)
+    for step in range(3):
+        with pytest.raises(OSError, match="File too large"):
+            board.log(step, {"a": 1.0})
+    assert list((tmp_path / "tensorboard").iterdir()) == []
+    size_limit(None)
+    board.log(3, {"a": 1.0})
+    board.close()
+    assert scalars(tmp_path, "a") == [(3, 1.0)]
 
 
 def test_a_copy_in_its_place_is_written_to(tmp_path):

@@ -1,6 +1,7 @@
 """Seeds that are trained in one program: each run is what it would have been by itself."""
 
 import json
+import shutil
 
 import jax
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from segvisrl_jax.commands.train import parse_config
 from segvisrl_jax.config import ConfigError, TrainConfig, preset_config, replace_fields
 from segvisrl_jax.training import loop
-from segvisrl_jax.training.checkpoint import load_policy
+from segvisrl_jax.training.checkpoint import MARK, load_policy
 
 SMALL = {"num_envs": 8, "unroll_length": 8, "num_minibatches": 2, "engine": "native", "max_decisions": 10}
 QUIET = {"say": lambda text: None}
@@ -65,10 +66,26 @@ def test_every_seed_leaves_a_run_of_its_own_which_can_go_on_alone(tmp_path):
         np.testing.assert_allclose(list(row.values()), list(same.values()), rtol=2e-3, atol=2e-4)
     kept, _, scores = load_policy(tmp_path / "pair-seed1" / "policy")
     assert (kept.seed, kept.num_seeds, scores["scenes"]) == (1, 1, "validation")
-    one = parse_config(["--resume", "--run", "pair-seed1", "--runs-dir", str(tmp_path), "--steps", "256"])
-    assert loop.train(one, **QUIET).decisions == 256
-    with pytest.raises(ConfigError, match=r"they have made \[3, 4\] updates"):
-        loop.train(replace_fields(going_on, steps=320), **QUIET)
+    one = parse_config(["--resume", "--run", "pair-seed1", "--runs-dir", str(tmp_path), "--steps", "320"])
+    assert loop.train(one, **QUIET).decisions == 320
+    with pytest.raises(ConfigError, match=r"they have made \[3, 5\] updates"):
+        loop.train(replace_fields(going_on, steps=384), **QUIET)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("updates", "back_to"), [(3, 2), (1, 0)])
+def test_seeds_that_are_killed_between_their_checkpoints_go_on_together(updates, back_to, tmp_path):
+    """Also between their first ones."""
+    asked = settings("mlp", num_seeds=2, run="pair", runs_dir=str(tmp_path), steps=64 * updates)
+    folders = loop.train(asked, **QUIET).run_dirs
+    undisturbed, said = [rows(folder) for folder in folders], []
+    shutil.rmtree(folders[1] / "checkpoints" / str(updates))
+    if not back_to:
+        (folders[1] / MARK).unlink()
+    result = loop.train(replace_fields(asked, resume=True), say=said.append)
+    assert (result.finished, result.not_on_disk, result.decisions) == (True, (), 64 * updates)
+    assert f"{folders[0]}: goes back from update {updates} to {back_to}, where all seeds were saved" in said
+    assert [rows(folder) for folder in folders] == undisturbed
 
 
 def test_one_folder_in_the_way_and_no_run_is_begun(tmp_path):
