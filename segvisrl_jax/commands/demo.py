@@ -8,6 +8,7 @@ from typing import Literal
 
 from segvisrl_jax.assets import DEFAULT_POLICY
 from segvisrl_jax.cli import parse
+from segvisrl_jax.commands.options import RunFolder
 from segvisrl_jax.config import require, require_file_can_be_written
 
 VIDEO_SUFFIXES = (".mp4", ".gif")
@@ -17,8 +18,8 @@ VIDEO_SUFFIXES = (".mp4", ".gif")
 class DemoOptions:
     """Lets a policy drive one scene and writes a video: camera, segmentation, what the policy sees, the map."""
 
-    run: Path | None = None
-    """A run's folder: its best policy drives."""
+    run: RunFolder | None = None
+    """A run's folder, or its name in runs/: its best policy drives."""
     policy: str | None = None
     """A policy's folder, or the name of a shipped one. Default: cnn_lstm."""
     controller: Literal["p", "random", "planner"] | None = None

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from segvisrl_jax.cli import parse
+from segvisrl_jax.commands.options import RunFolder
 from segvisrl_jax.config import (
     ConfigError,
     EngineName,
@@ -26,8 +27,8 @@ from segvisrl_jax.config.conditions import ConditionsConfig
 class EvalOptions:
     """Drives test scenes and reports shares with 95 % intervals. Same seed, same scenes, whoever drives."""
 
-    run: Path | None = None
-    """A run's folder: its best policy drives."""
+    run: RunFolder | None = None
+    """A run's folder, or its name in runs/: its best policy drives."""
     policy: str | None = None
     """A policy's folder, or the name of a shipped one."""
     controller: Literal["p", "random", "planner"] | None = None
@@ -183,7 +184,8 @@ def load_driver(run: Path | None, policy: str | None, controller: str | None) ->
     from segvisrl_jax.training.checkpoint import load_policy
 
     if run is not None and not (Path(run) / "policy" / "policy.json").is_file():
-        raise ConfigError(f"--run = {str(run)!r}: should be a run's folder that holds a policy (policy/policy.json)")
+        should = "a run's folder, or its name in runs/, that holds a policy (policy/policy.json)"
+        raise ConfigError(f"--run = {str(run)!r}: should be {should}")
     config, params, _ = load_policy(policy_folder(run, policy))
     network = make_network(config.arch, config.network, observation_shape(config.env))
     _require_parameters_that_fit(params, network, policy_folder(run, policy))

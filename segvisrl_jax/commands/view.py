@@ -5,10 +5,10 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from pathlib import Path
 
 from segvisrl_jax.assets import DEFAULT_POLICY
 from segvisrl_jax.cli import parse
+from segvisrl_jax.commands.options import RunFolder
 from segvisrl_jax.config import ConfigError, require
 
 
@@ -16,8 +16,8 @@ from segvisrl_jax.config import ConfigError, require
 class ViewOptions:
     """Opens a page in which a policy, or you, drive one scene, until Ctrl-C."""
 
-    run: Path | None = None
-    """A run's folder: its best policy drives."""
+    run: RunFolder | None = None
+    """A run's folder, or its name in runs/: its best policy drives."""
     policy: str | None = None
     """A policy's folder, or the name of a shipped one. Default: cnn_lstm."""
     scene: int = 0

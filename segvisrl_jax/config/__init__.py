@@ -30,6 +30,7 @@ from segvisrl_jax.config.paths import (
     is_disk_trouble,
     require_file_can_be_written,
     require_folder_can_be_made,
+    run_folder,
 )
 from segvisrl_jax.config.presets import preset_config
 from segvisrl_jax.config.tree import flatten, from_dict, option_words, replace_fields, to_dict
@@ -70,5 +71,6 @@ __all__ = [
     "require",
     "require_file_can_be_written",
     "require_folder_can_be_made",
+    "run_folder",
     "to_dict",
 ]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from segvisrl_jax.config.checks import LONGEST_NAME_BYTES, ConfigError, require, require_choice, require_types
 from segvisrl_jax.config.environment import EnvConfig
 from segvisrl_jax.config.names import ARCH_OBSERVATION, Arch, LoggerName, PresetName
-from segvisrl_jax.config.paths import A_PATH, is_path
+from segvisrl_jax.config.paths import A_PATH, RUNS_DIR, is_path
 
 LARGEST_BATCH = 10**8  # decisions: beyond it, images of any size fill every memory
 MOST_DEVICES = 2**16
@@ -168,7 +168,7 @@ class TrainConfig:
     """Training decisions in all (rounded up to whole updates)."""
     run: str = ""
     """Name of the run's folder; empty: made from arch, preset and seed."""
-    runs_dir: str = "runs"
+    runs_dir: str = RUNS_DIR
     """Where run folders go."""
     resume: bool = False
     """Go on from the run folder's last checkpoint."""

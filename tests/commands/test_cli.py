@@ -11,9 +11,15 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from segvisrl_jax.cli import main
+from segvisrl_jax.cli import main, parse
 from segvisrl_jax.commands import doctor
+from segvisrl_jax.commands.demo import DemoOptions
+from segvisrl_jax.commands.eval import EvalOptions
+from segvisrl_jax.commands.export import ExportOptions
+from segvisrl_jax.commands.report import ReportOptions
+from segvisrl_jax.commands.runs import RunsOptions
 from segvisrl_jax.commands.train import parse_config, resume_command, rocks_in_scenes
+from segvisrl_jax.commands.view import ViewOptions
 from segvisrl_jax.config import NotWrittenError, preset_config, replace_fields, to_dict
 from segvisrl_jax.cpu import num_cores
 from segvisrl_jax.training.run import open_run_dir
@@ -335,3 +341,15 @@ def test_the_command_that_goes_on_with_seeds_means_all_of_them(tmp_path):
         open_run_dir(each)
     goes_on = parse_config(shlex.split(resume_command(together))[2:])
     assert goes_on == replace_fields(together, resume=True)
+
+
+@pytest.mark.parametrize(("word", "found"), [("mine", "runs/mine"), ("runs/mine", "runs/mine"), ("here", "here")])
+def test_a_run_in_runs_is_known_by_its_name(word, found, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for folder in ("runs/mine", "runs/here", "here"):
+        Path(folder).mkdir(parents=True)
+    for command, kind in (("eval", EvalOptions), ("demo", DemoOptions), ("view", ViewOptions)):
+        assert parse(kind, ["--run", word], command).run == Path(found)
+    assert parse(ExportOptions, ["--format", "onnx", "--run", word], "export").run == Path(found)
+    assert parse(ReportOptions, [word, "nowhere"], "report").runs == (Path(found), Path("nowhere"))
+    assert parse(RunsOptions, [word], "runs").folder == Path(found)
