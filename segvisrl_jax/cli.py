@@ -16,12 +16,15 @@ import threading
 import typing
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from segvisrl_jax.config import ConfigError, NotWrittenError, is_disk_trouble
 from segvisrl_jax.cpu import make_callbacks_safe
 from segvisrl_jax.machine.memory import OutOfMemory, keep_freed_memory, one_line_where_memory_ends, what_there_is
 from segvisrl_jax.machine.programs import keep_compiled_programs
+
+if TYPE_CHECKING:
+    from tyro.constructors import ConstructorRegistry
 
 COMMANDS = {
     "train": "train a policy, evaluate it, draw its learning curve and a video",
@@ -169,7 +172,13 @@ def _complain(command: str, what: str) -> None:
         print(f"segvisrl {command}: {' '.join(what.splitlines())}", file=sys.stderr)
 
 
-def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: OptionsT | None = None) -> OptionsT:
+def parse(
+    kind: type[OptionsT],
+    options: Sequence[str],
+    command: str,
+    default: OptionsT | None = None,
+    registry: "ConstructorRegistry | None" = None,
+) -> OptionsT:
     """Options from the words of a command line; JAX's CPU backend is then set up, before what uses them starts it.
 
     Raises:
@@ -186,9 +195,9 @@ def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: O
     try:
         with contextlib.redirect_stderr(said):
             if default is None:
-                asked = tyro.cli(kind, args=words, prog=f"segvisrl {command}")
+                asked = tyro.cli(kind, args=words, prog=f"segvisrl {command}", registry=registry)
             else:
-                asked = tyro.cli(kind, args=words, prog=f"segvisrl {command}", default=default)
+                asked = tyro.cli(kind, args=words, prog=f"segvisrl {command}", default=default, registry=registry)
     except SystemExit as stop:
         if not stop.code:
             raise

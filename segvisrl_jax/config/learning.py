@@ -162,7 +162,8 @@ class TrainConfig:
     """cnn_lstm, cnn: segmented images, with and without memory; cnn_lstm_raw: colour images; mlp: the true state;
     mlp_rocks: the true state and the nearest rocks."""
     preset: PresetName = "cpu"
-    """Where the defaults come from: auto, if not said, is gpu where JAX has an accelerator, else cpu."""
+    """Where the other defaults come from. paper: the paper's settings; cpu, gpu: tuned ones; smoke: everything once,
+    tiny; auto, if not said: gpu where JAX has an accelerator, else cpu."""
     seed: int = 0
     steps: int = 327_680
     """Training decisions in all (rounded up to whole updates)."""

@@ -42,7 +42,8 @@ def segvisrl(*words, cwd):
     [
         (["fly"], ["'fly'", "train", "eval"]),
         (["train", "--arch", "resnet"], ["arch", "resnet", "cnn_lstm_raw"]),
-        (["train", "--preset", "huge"], ["preset", "huge", "smoke"]),
+        (["train", "--preset", "huge"], ["--preset", "huge", "one of auto, paper, cpu, gpu, smoke"]),
+        (["train", "--preset"], ["--preset", "followed by one of auto,"]),
         (["train", "--env.camera.scale", "-2"], ["scale", "-2", "1 or more"]),
         (["train", "--env.camera.scale", "600"], ["scale", "600", "at least 4 pixels"]),
         (["train", "--env.scene.num-rocks", "60", "--env.scene.rock-radius-max-m", "2"], ["num_rocks", "60", "2.0 m"]),
@@ -102,6 +103,7 @@ def test_help_lists_the_commands_and_their_options(tmp_path):
     options = segvisrl("train", "--help", cwd=tmp_path)
     assert options.returncode == 0
     assert "--env.camera.scale" in options.stdout
+    assert "--preset {auto,paper,cpu,gpu,smoke}" in options.stdout
 
 
 def test_a_reader_that_has_had_enough_is_no_failure(tmp_path):
