@@ -21,6 +21,7 @@ from segvisrl_jax.config import (
     from_dict,
     is_finite,
     is_plain_text,
+    program,
     read_json,
     require,
     require_file_can_be_written,
@@ -72,7 +73,9 @@ def _paths(given: Sequence[Path]) -> list[Path]:
     for path in given:
         inside = [path] if path.suffix == ".json" else sorted(path.glob("*.json"))
         if not inside:
-            raise ConfigError(f"{path}: holds no evaluation yet; segvisrl eval ... --json {path}/NAME.json writes one")
+            raise ConfigError(
+                f"{path}: holds no evaluation yet; {program()} eval ... --json {path}/NAME.json writes one"
+            )
         paths += inside
     return paths
 

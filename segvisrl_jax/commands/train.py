@@ -24,6 +24,7 @@ from segvisrl_jax.config import (
     one_line,
     option_words,
     preset_config,
+    program,
     read_json,
     replace_fields,
     require,
@@ -71,13 +72,13 @@ def run(options: Sequence[str]) -> int:
 
 def resume_command(config: TrainConfig) -> str:
     """The command that goes on with a run, or with all seeds: with what was said since the run began, too."""
-    words: list[Any] = ["segvisrl", "train", "--resume", "--runs-dir", config.runs_dir, "--run", config.run_name]
+    words: list[Any] = ["train", "--resume", "--runs-dir", config.runs_dir, "--run", config.run_name]
     if config.num_seeds > 1:
         words += ["--seed", config.seed, "--num-seeds", config.num_seeds]
     began = (config.resume and _stored_config(config.runs_dir, config.runs[0].run_name)) or config
     now, then = (flatten(to_dict(one)) for one in (config, began))
     words += [word for name in SAID_AGAIN if now[name] != then[name] for word in option_words(name, now[name])]
-    return shlex.join(map(str, words))
+    return f"{program()} {shlex.join(map(str, words))}"
 
 
 def _end_now(said: str) -> None:
@@ -257,8 +258,8 @@ def _finish(config: TrainConfig, run_dir: Path) -> list[str]:
     for path in (run_dir / "config.json", run_dir / "metrics.jsonl", *made, run_dir / "policy"):
         if path not in failed:
             print(f"  {path}{os.sep if path.is_dir() else ''}")
-    named = shlex.quote(str(run_dir))
-    print(f"Next: segvisrl eval --run {named} --episodes 1000    or    segvisrl demo --run {named} --scene 1")
+    named = f"--run {shlex.quote(str(run_dir))}"
+    print(f"Next: {program()} eval {named} --episodes 1000    or    {program()} demo {named} --scene 1")
     return list(failed.values())
 
 

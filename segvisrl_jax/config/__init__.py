@@ -33,6 +33,7 @@ from segvisrl_jax.config.paths import (
     run_folder,
 )
 from segvisrl_jax.config.presets import preset_config
+from segvisrl_jax.config.program import program
 from segvisrl_jax.config.tree import flatten, from_dict, option_words, replace_fields, to_dict
 
 __all__ = [
@@ -66,6 +67,7 @@ __all__ = [
     "one_line",
     "option_words",
     "preset_config",
+    "program",
     "read_json",
     "replace_fields",
     "require",

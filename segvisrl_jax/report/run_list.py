@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from segvisrl_jax.config import is_finite, is_plain_text, one_line, read_json, require
+from segvisrl_jax.config import is_finite, is_plain_text, one_line, program, read_json, require
 from segvisrl_jax.training.loggers import METRICS_FILE, STEP_KEY
 from segvisrl_jax.training.metrics_rows import MOST_DECISIONS, read_rows
 from segvisrl_jax.training.run_lock import is_being_trained
@@ -104,7 +104,7 @@ def _why_no_run(path: Path) -> str:
     if (path / "policy" / "policy.json").is_file() or (path / "policy.json").is_file():
         return "a policy without its run (no config.json)"
     num_runs = len(list(path.glob(f"*/{CONFIG_FILE}")))
-    return f"no run, but {num_runs} inside: segvisrl runs {path}" if num_runs else "no run (no config.json)"
+    return f"no run, but {num_runs} inside: {program()} runs {path}" if num_runs else "no run (no config.json)"
 
 
 def _summary(name: str, path: Path, test: Score | None) -> RunSummary:

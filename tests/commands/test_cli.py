@@ -164,7 +164,7 @@ def test_train_eval_demo_as_a_user_does(arch, tmp_path):
     assert "differs from the paper's settings" in trained.stdout
     run = tmp_path / "runs" / f"{arch}-smoke-seed0"
     require_files_of(run)
-    assert f"segvisrl eval --run runs/{run.name}" in trained.stdout
+    assert f"-m segvisrl_jax eval --run runs/{run.name}" in trained.stdout
 
     again = segvisrl("train", "--arch", arch, *SMOKE, cwd=tmp_path)
     assert again.returncode == 2
