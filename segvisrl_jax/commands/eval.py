@@ -172,43 +172,18 @@ def load_driver(run: Path | None, policy: str | None, controller: str | None) ->
     given = [name for name, value in (("--run", run), ("--policy", policy), ("--controller", controller)) if value]
     require(len(given) == 1, "--run, --policy, --controller", " and ".join(given) or "none given", "exactly one")
 
-    from segvisrl_jax.training.policy import CONTROLLERS, network_policy
+    from segvisrl_jax.training.policy import CONTROLLERS, load_network, network_policy
 
     if controller:
         require(controller in CONTROLLERS, "--controller", controller, "one of " + ", ".join(CONTROLLERS))
         world = EnvConfig(obs="state")
         return CONTROLLERS[controller](world), (), world
 
-    from segvisrl_jax.agent.networks import make_network
-    from segvisrl_jax.env.rover_env import observation_shape
-    from segvisrl_jax.training.checkpoint import load_policy
-
     if run is not None and not (Path(run) / "policy" / "policy.json").is_file():
         should = "a run's folder, or its name in runs/, that holds a policy (policy/policy.json)"
         raise ConfigError(f"--run = {str(run)!r}: should be {should}")
-    config, params, _ = load_policy(policy_folder(run, policy))
-    network = make_network(config.arch, config.network, observation_shape(config.env))
-    _require_parameters_that_fit(params, network, policy_folder(run, policy))
+    config, network, params = load_network(policy_folder(run, policy))
     return network_policy(network, config.arch), params, held_out(config)
-
-
-def _require_parameters_that_fit(params: Any, network: Any, folder: Path) -> None:
-    """A policy's folder may have been put together by hand."""
-    import jax
-
-    needed = jax.eval_shape(network.init, jax.random.key(0))
-    ours, theirs = (
-        {jax.tree_util.keystr(path): leaf.shape for path, leaf in _leaves(tree)} for tree in (params, needed)
-    )
-    for name in sorted(ours.keys() | theirs.keys()):
-        should = f"of shape {theirs[name]}, as its settings have it" if name in theirs else "left out"
-        require(ours.get(name) == theirs.get(name), f"{folder}: {name}", ours.get(name), should)
-
-
-def _leaves(tree: Any) -> Any:
-    import jax
-
-    return jax.tree_util.tree_flatten_with_path(tree)[0]
 
 
 def policy_folder(run: Path | None, policy: str | None) -> Path:
