@@ -58,6 +58,7 @@ COMPLAINTS = {
     r"Error parsing (?P<option>-\S+): no type matching \{None\}\|INT could be instantiated from "
     r"\[(?P<value>.*?)\]\. Got errors: .*": "a whole number, or None",
     r"invalid choice (?P<value>.*) for argument '(?P<option>.*)'\. Expected one of \((?P<choices>.*)\)\.": "one of ",
+    r"Missing from segvisrl \w+: (?P<option>\S+) \{(?P<choices>[^}]*)\} .*": "one of ",
     r"Missing value for argument '(?P<option>.*)'\. Expected \d+ values?\.": "followed by a value",
 }
 """What tyro says of a value, and what would be right."""
@@ -76,7 +77,7 @@ ELSEWHERE = {
 def main(argv: Sequence[str] | None = None) -> int:
     """The program. Returns its exit code: 0, 1 for a failure, 2 for a mistake in what was asked, 130 after Ctrl-C."""
     words = list(sys.argv[1:] if argv is None else argv)
-    if not words or words[0] in ("-h", "--help"):
+    if not words or words[0] in ("-h", "--help", "help"):
         print(_usage())
         return 0 if words else USAGE_ERROR
     command, options = words[0], words[1:]
@@ -250,9 +251,10 @@ def _in_our_words(message: str, words: Sequence[str], command: str) -> str:
         found = re.fullmatch(pattern, complaint)
         if found:
             said = found.groupdict()
-            choices = ", ".join(sorted(re.findall(r"'([^']*)'", said.get("choices", ""))))
+            choices = ", ".join(sorted(re.findall(r"[\w.-]+", said.get("choices", ""))))
             value = _as_typed(said.get("value", "nothing"), words)
-            return f"{said['option']} = {value}: should be {should}{choices}"
+            dashes = "--" if complaint.startswith("Missing from") else ""
+            return f"{dashes}{said['option']} = {value}: should be {should}{choices}"
     unknown = re.fullmatch(r"Unrecognized options: (.*)", complaint)
     if not unknown:
         return complaint
@@ -264,7 +266,8 @@ def _in_our_words(message: str, words: Sequence[str], command: str) -> str:
     meant = (ELSEWHERE.get(name) if command == "train" else None) or _suggested(message)
     if meant and first.startswith("--"):
         return f"{unknown[1]}: should be {meant}, if that was meant; --help lists the options"
-    return f"{unknown[1]}: should be left out; --help lists the options"
+    should = "left out" if first.startswith("-") else "left out, or follow an option"
+    return f"{unknown[1]}: should be {should}; --help lists the options"
 
 
 def _suggested(message: str) -> str:

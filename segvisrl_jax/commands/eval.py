@@ -22,6 +22,8 @@ from segvisrl_jax.config import (
 )
 from segvisrl_jax.config.conditions import ConditionsConfig
 
+ONE_DRIVER = "exactly one, as in --policy cnn_lstm"
+
 
 @dataclass(frozen=True)
 class EvalOptions:
@@ -170,7 +172,7 @@ def load_driver(run: Path | None, policy: str | None, controller: str | None) ->
         ConfigError: unless exactly one is given and can be read.
     """
     given = [name for name, value in (("--run", run), ("--policy", policy), ("--controller", controller)) if value]
-    require(len(given) == 1, "--run, --policy, --controller", " and ".join(given) or "none given", "exactly one")
+    require(len(given) == 1, "--run, --policy, --controller", " and ".join(given) or "none given", ONE_DRIVER)
 
     from segvisrl_jax.training.policy import CONTROLLERS, load_network, network_policy
 

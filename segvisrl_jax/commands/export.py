@@ -32,7 +32,12 @@ class ExportOptions:
 
     def __post_init__(self) -> None:
         given = [name for name, value in (("--run", self.run), ("--policy", self.policy)) if value]
-        require(len(given) == 1, "--run, --policy", " and ".join(given) or "none given", "exactly one")
+        require(
+            len(given) == 1,
+            "--run, --policy",
+            " and ".join(given) or "none given",
+            "exactly one, as in --policy cnn_lstm",
+        )
         require(1 <= self.scenes <= 1000, "--scenes", self.scenes, "in [1, 1000]")
         if self.output is not None:
             suffix = SUFFIXES[self.format]

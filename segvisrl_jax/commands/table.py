@@ -73,9 +73,10 @@ def _paths(given: Sequence[Path]) -> list[Path]:
     for path in given:
         inside = [path] if path.suffix == ".json" else sorted(path.glob("*.json"))
         if not inside:
-            raise ConfigError(
-                f"{path}: holds no evaluation yet; {program()} eval ... --json {path}/NAME.json writes one"
-            )
+            has_runs = any(path.glob("*/eval.json"))
+            written = f"{program()} eval ... --json {path}/NAME.json writes one"
+            hint = f"{path}/*/eval.json are those of runs" if has_runs else written
+            raise ConfigError(f"{path}: holds no evaluation; {hint}")
         paths += inside
     return paths
 

@@ -230,7 +230,10 @@ class TrainConfig:
         self._require_even_shares()
         is_name = "/" not in self.run and self.run not in (".", "..") and self.run == self.run.strip()
         is_name = is_name and len(self.run.encode()) <= LONGEST_NAME_BYTES
-        require(is_name, "run", self.run, f"a folder's name without slashes, at most {LONGEST_NAME_BYTES} bytes long")
+        should = (
+            f"a folder's name without slashes, at most {LONGEST_NAME_BYTES} bytes long; --runs-dir says where it is"
+        )
+        require(is_name, "run", self.run, should)
         require(len(self.runs_dir) > 0, "runs_dir", self.runs_dir, "a folder; . is this one")
         for name in ("runs_dir", "start_from"):
             require(is_path(getattr(self, name)), name, getattr(self, name), A_PATH)

@@ -56,7 +56,9 @@ def segvisrl(*words, cwd):
         (["train", "--env.renderer", "crayon"], ["--env.renderer", "crayon", "scanline"]),
         (["train", "--env.physics.engine", "bullet"], ["bullet", "native"]),
         (["train", "--resume", "--run", "nothing"], ["nothing", "no checkpoint"]),
-        (["eval"], ["--run, --policy, --controller", "exactly one"]),
+        (["eval"], ["--run, --policy, --controller", "exactly one, as in --policy cnn_lstm"]),
+        (["eval", "cnn_lstm"], ["cnn_lstm", "should be left out, or follow an option"]),
+        (["train", "--resume", "--run", "runs/x"], ["'runs/x'", "without slashes", "--runs-dir"]),
         (["eval", "--controller", "p", "--policy", "x"], ["exactly one"]),
         (["eval", "--controller", "q"], ["--controller", "q"]),
         (["eval", "--controller", "p", "--episodes", "0"], ["--episodes", "0"]),
@@ -99,7 +101,8 @@ def test_a_mistake_ends_the_program_so_too(tmp_path):
 
 
 def test_help_lists_the_commands_and_their_options(tmp_path):
-    assert "train" in segvisrl("--help", cwd=tmp_path).stdout
+    for word in ("--help", "help"):
+        assert "train" in segvisrl(word, cwd=tmp_path).stdout
     options = segvisrl("train", "--help", cwd=tmp_path)
     assert options.returncode == 0
     assert "--env.camera.scale" in options.stdout
@@ -343,6 +346,17 @@ def test_the_command_that_goes_on_with_seeds_means_all_of_them(tmp_path):
         open_run_dir(each)
     goes_on = parse_config(shlex.split(resume_command(together))[2:])
     assert goes_on == replace_fields(together, resume=True)
+
+
+@pytest.mark.parametrize("word", ["mine", "runs/mine"])
+def test_a_run_that_is_taken_for_a_policy_is_said_to_be_one(word, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    policy = Path("runs/mine/policy/policy.json")
+    policy.parent.mkdir(parents=True)
+    policy.touch()
+    assert main(["eval", "--policy", word]) == 2
+    assert f"policy = '{word}'" in (said := capsys.readouterr().err)
+    assert "; this is a run, and runs/mine/policy its policy" in said
 
 
 @pytest.mark.parametrize(("word", "found"), [("mine", "runs/mine"), ("runs/mine", "runs/mine"), ("here", "here")])
