@@ -37,12 +37,15 @@ class EvalOptions:
     """p: the paper's proportional controller, which knows where the goal is; random: uniform wheel speeds; planner:
     knows goal and rocks, and follows the shortest path around them."""
     episodes: int = 1000
+    """How many scenes are driven; 1000 leave an interval of 0.4 points at 100 %, 100 leave 3.7."""
     seed: int = 0
     """Names the test scenes."""
     num_rocks: int | None = None
     """Rocks on the map; default: env.scene.num_rocks of the policy's settings."""
     renderer: RendererName | None = None
+    """Who draws what the policy sees; default: env.renderer of its settings."""
     physics: EngineName | None = None
+    """Who computes the motion; default: env.physics.engine of the policy's settings."""
     json: Path | None = None
     """Where to write the result as JSON."""
     slots: int = 256

@@ -41,3 +41,8 @@ def with_auto() -> tyro.constructors.ConstructorRegistry:
         )
 
     return registry
+
+
+def one_or_more(name: str) -> object:
+    """How the help shows what is given one or several times, without an option."""
+    return tyro.conf.arg(metavar=f"{name} ...", help_behavior_hint="(one or more)")

@@ -28,9 +28,11 @@ class SweepOptions:
     """FIELD=VALUE,VALUE for any option of ``segvisrl train``, whole or by its last part:
     --vary scale=20,40 arch=cnn,cnn_lstm seed=0,1,2 discount=0.95,0.97"""
     preset: PresetName = "cpu"
+    """Where the other settings of each run come from, as for ``segvisrl train``."""
     steps: int | None = None
     """Training decisions of each run; default: the preset's."""
     output: Path = Path("runs/sweep")
+    """The folder of the runs, their logs, the table and the plot."""
     args: str = ""
     """More options of ``segvisrl train`` for every run, in one string."""
     engine: Literal["local", "ray"] = "local"

@@ -7,12 +7,13 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
 from segvisrl_jax.cli import parse
+from segvisrl_jax.commands.options import one_or_more
 from segvisrl_jax.config import (
     ConfigError,
     EnvConfig,
@@ -43,7 +44,7 @@ WORLD = ("gravity_m_s2", "top_speed_m_s", "wheel_friction")  # settings of physi
 class TableOptions:
     """Makes the results table from evaluations that `segvisrl eval --json` wrote on the same test scenes."""
 
-    files: tyro.conf.Positional[tuple[Path, ...]]
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional, one_or_more("EVAL.json")]
     """Evaluations, or folders of them. Other numbers of rocks go to tables of their own."""
     output: Path | None = None
     """Where to write it, .md; default: print it."""

@@ -1,8 +1,10 @@
 """The program as a user types it: what it prints, what it leaves, and one line for every mistake."""
 
 import errno
+import itertools
 import json
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -11,7 +13,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from segvisrl_jax.cli import main, parse
+from segvisrl_jax.cli import COMMANDS, main, parse
 from segvisrl_jax.commands import doctor
 from segvisrl_jax.commands.demo import DemoOptions
 from segvisrl_jax.commands.eval import EvalOptions
@@ -107,6 +109,19 @@ def test_help_lists_the_commands_and_their_options(tmp_path):
     assert options.returncode == 0
     assert "--env.camera.scale" in options.stdout
     assert "--preset {auto,paper,cpu,gpu,smoke}" in options.stdout
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_every_option_is_explained(command, capsys):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    lines = [line.strip(" │") for line in capsys.readouterr().out.splitlines()]
+    assert any(line.startswith("-h, --help") for line in lines)
+    values = r"(\{.*?\}|\[.*?\]\]?|[A-Z]+|\|)*"  # metavar
+    options = [(line, after) for line, after in itertools.pairwise(lines) if line.startswith("--")]
+    for line, after in options:
+        explained = re.sub(rf"^--\S+ {values}", "", line).strip() or after
+        assert not explained.startswith("("), f"{command}: {line}"
 
 
 def test_a_reader_that_has_had_enough_is_no_failure(tmp_path):
