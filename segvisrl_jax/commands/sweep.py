@@ -66,7 +66,7 @@ def run(options: Sequence[str]) -> int:
     from segvisrl_jax.sweep.results import DONE, in_words, result_row, why_unfinished, write_csv
     from segvisrl_jax.sweep.trainings import Trainings
 
-    asked = parse(SweepOptions, options, "sweep")
+    asked = parse(SweepOptions, _with_args_whole(options), "sweep")
     words = ["--preset", asked.preset, *(["--steps", str(asked.steps)] if asked.steps else [])]
     require_folder_can_be_made(asked.output, "--output")
     axes = [parse_axis(text) for text in asked.vary]
@@ -97,6 +97,14 @@ def run(options: Sequence[str]) -> int:
     write_csv(asked.output / "results.csv", trials, rows)
     code = _report(asked, [axis.label for axis in axes], rows)
     return INTERRUPTED if code and trainings.is_stopping else code
+
+
+def _with_args_whole(options: Sequence[str]) -> list[str]:
+    """``--args "--seed 1"`` as ``--args=--seed 1``: else what begins with dashes would be an option, and no value."""
+    words = list(options)
+    for place in [i for i, word in enumerate(words[:-1]) if word == "--args"][::-1]:
+        words[place : place + 2] = [f"--args={words[place + 1]}"]
+    return words
 
 
 def _train(
