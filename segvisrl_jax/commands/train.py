@@ -100,6 +100,8 @@ def parse_config(options: Sequence[str]) -> TrainConfig:
             name += f"-seed{_value(words, '--seed', '0')}"  # the first of them; the option itself takes its place
         base = _stored_config(runs_dir, name)
         if base is not None:
+            asked, should = _value(words, "--arch", base.arch), f"{base.arch!r}, as when {name} was started"
+            require(asked == base.arch, "arch", asked, should)  # else its other settings would be told not to fit
             return parse(TrainConfig, words, "train", base, with_auto())
     require(words[-1:] != ["--preset"], "--preset", "nothing", "followed by one of " + ", ".join(PRESETS))
     require(preset in PRESETS, "--preset", preset, "one of " + ", ".join(PRESETS))
@@ -259,7 +261,7 @@ def _finish(config: TrainConfig, run_dir: Path) -> list[str]:
         if path not in failed:
             print(f"  {path}{os.sep if path.is_dir() else ''}")
     named = f"--run {shlex.quote(str(run_dir))}"
-    print(f"Next: {program()} eval {named} --episodes 1000    or    {program()} demo {named} --scene 1")
+    print(f"Next:\n  {program()} eval {named} --episodes 1000\n  {program()} demo {named} --scene 1")
     return list(failed.values())
 
 

@@ -22,7 +22,7 @@ from segvisrl_jax.commands.report import ReportOptions
 from segvisrl_jax.commands.runs import RunsOptions
 from segvisrl_jax.commands.train import parse_config, resume_command, rocks_in_scenes
 from segvisrl_jax.commands.view import ViewOptions
-from segvisrl_jax.config import NotWrittenError, preset_config, replace_fields, to_dict
+from segvisrl_jax.config import ConfigError, NotWrittenError, preset_config, replace_fields, to_dict
 from segvisrl_jax.cpu import num_cores
 from segvisrl_jax.training.run import open_run_dir
 
@@ -318,6 +318,8 @@ def test_a_run_that_was_moved_goes_on_where_it_is(tmp_path, monkeypatch):
     goes_on = parse_config(["--resume", "--run", "moved"])
     assert (goes_on.runs_dir, goes_on.run, goes_on.seed) == ("runs", "moved", 3)
     assert resume_command(goes_on) == "segvisrl train --resume --runs-dir runs --run moved"
+    with pytest.raises(ConfigError, match="arch = 'cnn': should be 'mlp', as when moved was started"):
+        parse_config(["--resume", "--run", "moved", "--arch", "cnn"])
     longer = parse_config(["--resume", "--run", "moved", "--steps", "99999", "--loggers", "wandb", "mlflow"])
     assert parse_config(shlex.split(resume_command(longer))[2:]) == longer
 
