@@ -1,8 +1,8 @@
 """Visual-navigation reinforcement learning for a small lunar rover, on MuJoCo / MJX and JAX.
 
-``make_env`` builds the environment; ``train`` trains a policy; ``load_policy`` reads a trained one. Names are imported
-when they are first used, so that importing the package is quick and touches no device. Importing it also registers
-``segvisrl_jax/LunarRover-v0`` with Gymnasium.
+``make_env`` builds the environment; ``train`` trains a policy; ``Predictor`` is a trained one that decides, and
+``load_policy`` reads its settings and parameters. Names are imported when they are first used, so that importing the
+package is quick and touches no device. Importing it also registers ``segvisrl_jax/LunarRover-v0`` with Gymnasium.
 """
 
 import importlib.metadata
@@ -14,6 +14,7 @@ GYMNASIUM_ID = "segvisrl_jax/LunarRover-v0"
 _PUBLIC = {
     "ConfigError": "segvisrl_jax.config",
     "EnvConfig": "segvisrl_jax.config",
+    "Predictor": "segvisrl_jax.adapters.predictor",
     "RoverEnv": "segvisrl_jax.env.rover_env",
     "TrainConfig": "segvisrl_jax.config",
     "downsample": "segvisrl_jax.vision.resample",

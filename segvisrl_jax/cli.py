@@ -16,12 +16,15 @@ import threading
 import typing
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from segvisrl_jax.config import ConfigError, NotWrittenError, is_disk_trouble
 from segvisrl_jax.cpu import make_callbacks_safe
 from segvisrl_jax.machine.memory import OutOfMemory, keep_freed_memory, one_line_where_memory_ends, what_there_is
 from segvisrl_jax.machine.programs import keep_compiled_programs
+
+if TYPE_CHECKING:
+    from tyro.constructors import ConstructorRegistry
 
 COMMANDS = {
     "train": "train a policy, evaluate it, draw its learning curve and a video",
@@ -56,6 +59,7 @@ COMPLAINTS = {
     r"Error parsing (?P<option>-\S+): no type matching \{None\}\|INT could be instantiated from "
     r"\[(?P<value>.*?)\]\. Got errors: .*": "a whole number, or None",
     r"invalid choice (?P<value>.*) for argument '(?P<option>.*)'\. Expected one of \((?P<choices>.*)\)\.": "one of ",
+    r"Missing from segvisrl \w+: (?P<option>\S+) \{(?P<choices>[^}]*)\} .*": "one of ",
     r"Missing value for argument '(?P<option>.*)'\. Expected \d+ values?\.": "followed by a value",
 }
 """What tyro says of a value, and what would be right."""
@@ -75,7 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The program. Returns its exit code: 0, 1 for a failure, 2 for a mistake in what was asked, 130 after Ctrl-C."""
     _open_what_is_closed()
     words = list(sys.argv[1:] if argv is None else argv)
-    if not words or words[0] in ("-h", "--help"):
+    if not words or words[0] in ("-h", "--help", "help"):
         print(_usage())
         return 0 if words else USAGE_ERROR
     command, options = words[0], words[1:]
@@ -181,7 +185,13 @@ def _complain(command: str, what: str) -> None:
         print(f"segvisrl {command}: {' '.join(what.splitlines())}", file=sys.stderr)
 
 
-def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: OptionsT | None = None) -> OptionsT:
+def parse(
+    kind: type[OptionsT],
+    options: Sequence[str],
+    command: str,
+    default: OptionsT | None = None,
+    registry: "ConstructorRegistry | None" = None,
+) -> OptionsT:
     """Options from the words of a command line; JAX's CPU backend is then set up, before what uses them starts it.
 
     Raises:
@@ -198,9 +208,9 @@ def parse(kind: type[OptionsT], options: Sequence[str], command: str, default: O
     try:
         with contextlib.redirect_stderr(said):
             if default is None:
-                asked = tyro.cli(kind, args=words, prog=f"segvisrl {command}")
+                asked = tyro.cli(kind, args=words, prog=f"segvisrl {command}", registry=registry)
             else:
-                asked = tyro.cli(kind, args=words, prog=f"segvisrl {command}", default=default)
+                asked = tyro.cli(kind, args=words, prog=f"segvisrl {command}", default=default, registry=registry)
     except SystemExit as stop:
         if not stop.code:
             raise
@@ -253,9 +263,10 @@ def _in_our_words(message: str, words: Sequence[str], command: str) -> str:
         found = re.fullmatch(pattern, complaint)
         if found:
             said = found.groupdict()
-            choices = ", ".join(sorted(re.findall(r"'([^']*)'", said.get("choices", ""))))
+            choices = ", ".join(sorted(re.findall(r"[\w.-]+", said.get("choices", ""))))
             value = _as_typed(said.get("value", "nothing"), words)
-            return f"{said['option']} = {value}: should be {should}{choices}"
+            dashes = "--" if complaint.startswith("Missing from") else ""
+            return f"{dashes}{said['option']} = {value}: should be {should}{choices}"
     unknown = re.fullmatch(r"Unrecognized options: (.*)", complaint)
     if not unknown:
         return complaint
@@ -267,7 +278,8 @@ def _in_our_words(message: str, words: Sequence[str], command: str) -> str:
     meant = (ELSEWHERE.get(name) if command == "train" else None) or _suggested(message)
     if meant and first.startswith("--"):
         return f"{unknown[1]}: should be {meant}, if that was meant; --help lists the options"
-    return f"{unknown[1]}: should be left out; --help lists the options"
+    should = "left out" if first.startswith("-") else "left out, or follow an option"
+    return f"{unknown[1]}: should be {should}; --help lists the options"
 
 
 def _suggested(message: str) -> str:

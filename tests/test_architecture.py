@@ -19,7 +19,7 @@ MAY_IMPORT = {  # part -> the parts it may import, besides itself
     "agent": {"config", "types", "cpu", "ffi"},
     "training": {"assets", "config", "types", "cpu", "env", "vision", "agent"},
     "report": {"config", "types", "env", "vision", "training"},
-    "adapters": {"config", "types", "env", "report"},
+    "adapters": {"config", "types", "env", "agent", "training", "report"},
     "export": {"config", "env", "vision", "training", "agent", "report"},
     "sweep": {"config", "training"},
     "machine": {"config", "cpu", "env", "vision", "agent", "training", "adapters"},
@@ -41,6 +41,7 @@ MAY_IMPORT = {  # part -> the parts it may import, besides itself
         "cli",
     },
     "cli": {"config", "commands", "cpu", "machine"},
+    "__main__": {"cli"},
     "__init__": {"config", "env", "vision", "training"},
 }
 ENV_DATA = {"env.model", "env.rocks", "env.scene", "env.pose"}

@@ -1,1 +1,1 @@
-"""The environment in other libraries' terms: ``gymnasium`` and ``brax``."""
+"""The environment, and trained policies, in other libraries' terms."""

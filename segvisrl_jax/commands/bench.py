@@ -61,10 +61,15 @@ class BenchOptions:
     num_rocks: tuple[int, ...] = (4,)
     """Rocks in the renderers' scenes."""
     repeats: int = 5
+    """Measurements of each kind; their median is told."""
     arch: Arch = "cnn_lstm"
+    """Whose network, for policy, update, train, start and growth."""
     preset: PresetName = "cpu"
+    """Whose sizes and settings."""
     engines: tuple[EngineName, ...] = ("native", "mjx")
+    """Who computes physics, one after another."""
     renderers: tuple[PlainRenderer, ...] = ("scanline", "gl", "warp", "mujoco.Renderer")
+    """Who draws, one after another; mujoco.Renderer is MuJoCo's class as one would use it without this project."""
     json: Path | None = None
     """Where to write the result as JSON."""
     plot: Path | None = None

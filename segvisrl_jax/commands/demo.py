@@ -4,10 +4,13 @@ import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 from segvisrl_jax.assets import DEFAULT_POLICY
 from segvisrl_jax.cli import parse
+from segvisrl_jax.commands.options import RunFolder
 from segvisrl_jax.config import require, require_file_can_be_written
 
 VIDEO_SUFFIXES = (".mp4", ".gif")
@@ -17,14 +20,16 @@ VIDEO_SUFFIXES = (".mp4", ".gif")
 class DemoOptions:
     """Lets a policy drive one scene and writes a video: camera, segmentation, what the policy sees, the map."""
 
-    run: Path | None = None
-    """A run's folder: its best policy drives."""
-    policy: str | None = None
-    """A policy's folder, or the name of a shipped one. Default: cnn_lstm."""
+    run: RunFolder | None = None
+    """A run's folder, or its name in runs/: its best policy drives."""
+    policy: Annotated[str | None, tyro.conf.arg(help_behavior_hint=f"(default: {DEFAULT_POLICY})")] = None
+    """A policy's folder, or the name of a shipped one."""
     controller: Literal["p", "random", "planner"] | None = None
+    """What drives in place of a policy, as for `segvisrl eval`."""
     scene: int = 0
     """Number of the test scene, among those of `segvisrl eval --seed 0`."""
     num_rocks: int | None = None
+    """Rocks on the map; default: env.scene.num_rocks of the policy's settings."""
     output: Path = Path("demo.mp4")
     """Where to write the video, .mp4 or .gif."""
     gif: bool = False

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from segvisrl_jax.cli import parse
+from segvisrl_jax.commands.options import RunFolder
 from segvisrl_jax.config import require, require_file_can_be_written
 from segvisrl_jax.export.formats import SUFFIXES, FormatName, file_format, require_packages
 
@@ -20,8 +21,8 @@ class ExportOptions:
 
     format: FormatName
     """onnx: for ONNX Runtime and others, needs segvisrl_jax[onnx]; stablehlo: a zip for JAX, on CPU, CUDA and TPU."""
-    run: Path | None = None
-    """A run's folder: its best policy is exported."""
+    run: RunFolder | None = None
+    """A run's folder, or its name in runs/: its best policy is exported."""
     policy: str | None = None
     """A policy's folder, or the name of a shipped one."""
     output: Path | None = None
@@ -31,7 +32,12 @@ class ExportOptions:
 
     def __post_init__(self) -> None:
         given = [name for name, value in (("--run", self.run), ("--policy", self.policy)) if value]
-        require(len(given) == 1, "--run, --policy", " and ".join(given) or "none given", "exactly one")
+        require(
+            len(given) == 1,
+            "--run, --policy",
+            " and ".join(given) or "none given",
+            "exactly one, as in --policy cnn_lstm",
+        )
         require(1 <= self.scenes <= 1000, "--scenes", self.scenes, "in [1, 1000]")
         if self.output is not None:
             suffix = SUFFIXES[self.format]

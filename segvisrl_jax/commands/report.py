@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from segvisrl_jax.cli import parse
+from segvisrl_jax.commands.options import RunFolder, one_or_more
 from segvisrl_jax.config import EnvConfig, replace_fields, require, require_file_can_be_written
 
 if TYPE_CHECKING:
@@ -32,8 +33,8 @@ MOST_VIDEOS = 6  # more would be skipped by readers, and make the page heavy
 class ReportOptions:
     """Drives test scenes with the policies of runs and writes an HTML page that needs no other file."""
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN ...")]
-    """Folders that segvisrl train wrote."""
+    runs: Annotated[tuple[RunFolder, ...], tyro.conf.Positional, one_or_more("RUN")]
+    """Folders that segvisrl train wrote, or their names in runs/."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("report.html")
     """Where to write the page, .html."""
     episodes: int = 100

@@ -6,12 +6,14 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from segvisrl_jax.cli import parse
+from segvisrl_jax.commands.options import RunFolder
 from segvisrl_jax.config import require
+from segvisrl_jax.config.paths import RUNS_DIR
 from segvisrl_jax.report.run_list import Complaint, RunSummary, Score, list_runs
 
 if TYPE_CHECKING:
@@ -30,8 +32,8 @@ STYLES = {"finished": "green", "running": "cyan", "stopped": "yellow"}
 class RunsOptions:
     """Lists the runs in a folder: settings, how far they are, success while training and on the test scenes."""
 
-    folder: tyro.conf.Positional[Path] = Path("runs")
-    """Folder of run folders, or one run."""
+    folder: Annotated[RunFolder, tyro.conf.Positional, tyro.conf.arg(metavar="[DIR]")] = Path(RUNS_DIR)
+    """Folder of run folders, or one run; in runs/ its name will do."""
     sort: SortKey = "name"
     """By name, or with the latest, best, longest first."""
     json: bool = False

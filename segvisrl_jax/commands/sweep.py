@@ -28,9 +28,11 @@ class SweepOptions:
     """FIELD=VALUE,VALUE for any option of ``segvisrl train``, whole or by its last part:
     --vary scale=20,40 arch=cnn,cnn_lstm seed=0,1,2 discount=0.95,0.97"""
     preset: PresetName = "cpu"
+    """Where the other settings of each run come from, as for ``segvisrl train``."""
     steps: int | None = None
     """Training decisions of each run; default: the preset's."""
     output: Path = Path("runs/sweep")
+    """The folder of the runs, their logs, the table and the plot."""
     args: str = ""
     """More options of ``segvisrl train`` for every run, in one string."""
     engine: Literal["local", "ray"] = "local"
@@ -64,7 +66,7 @@ def run(options: Sequence[str]) -> int:
     from segvisrl_jax.sweep.results import DONE, in_words, result_row, why_unfinished, write_csv
     from segvisrl_jax.sweep.trainings import Trainings
 
-    asked = parse(SweepOptions, options, "sweep")
+    asked = parse(SweepOptions, _with_args_whole(options), "sweep")
     words = ["--preset", asked.preset, *(["--steps", str(asked.steps)] if asked.steps else [])]
     require_folder_can_be_made(asked.output, "--output")
     axes = [parse_axis(text) for text in asked.vary]
@@ -95,6 +97,14 @@ def run(options: Sequence[str]) -> int:
     write_csv(asked.output / "results.csv", trials, rows)
     code = _report(asked, [axis.label for axis in axes], rows)
     return INTERRUPTED if code and trainings.is_stopping else code
+
+
+def _with_args_whole(options: Sequence[str]) -> list[str]:
+    """``--args "--seed 1"`` as ``--args=--seed 1``: else what begins with dashes would be an option, and no value."""
+    words = list(options)
+    for place in [i for i, word in enumerate(words[:-1]) if word == "--args"][::-1]:
+        words[place : place + 2] = [f"--args={words[place + 1]}"]
+    return words
 
 
 def _train(

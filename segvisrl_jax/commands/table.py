@@ -7,12 +7,13 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
 from segvisrl_jax.cli import parse
+from segvisrl_jax.commands.options import one_or_more
 from segvisrl_jax.config import (
     ConfigError,
     EnvConfig,
@@ -21,6 +22,7 @@ from segvisrl_jax.config import (
     from_dict,
     is_finite,
     is_plain_text,
+    program,
     read_json,
     require,
     require_file_can_be_written,
@@ -42,7 +44,7 @@ WORLD = ("gravity_m_s2", "top_speed_m_s", "wheel_friction")  # settings of physi
 class TableOptions:
     """Makes the results table from evaluations that `segvisrl eval --json` wrote on the same test scenes."""
 
-    files: tyro.conf.Positional[tuple[Path, ...]]
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional, one_or_more("EVAL.json")]
     """Evaluations, or folders of them. Other numbers of rocks go to tables of their own."""
     output: Path | None = None
     """Where to write it, .md; default: print it."""
@@ -72,7 +74,10 @@ def _paths(given: Sequence[Path]) -> list[Path]:
     for path in given:
         inside = [path] if path.suffix == ".json" else sorted(path.glob("*.json"))
         if not inside:
-            raise ConfigError(f"{path}: holds no evaluation yet; segvisrl eval ... --json {path}/NAME.json writes one")
+            has_runs = any(path.glob("*/eval.json"))
+            written = f"{program()} eval ... --json {path}/NAME.json writes one"
+            hint = f"{path}/*/eval.json are those of runs" if has_runs else written
+            raise ConfigError(f"{path}: holds no evaluation; {hint}")
         paths += inside
     return paths
 

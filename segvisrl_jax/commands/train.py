@@ -7,9 +7,10 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from segvisrl_jax.cli import FAILURE, INTERRUPTED, parse
+from segvisrl_jax.commands.options import AUTO, PRESETS, with_auto
 from segvisrl_jax.config import (
     BOOKKEEPING,
     IMAGE_OBSERVATIONS,
@@ -23,6 +24,7 @@ from segvisrl_jax.config import (
     one_line,
     option_words,
     preset_config,
+    program,
     read_json,
     replace_fields,
     require,
@@ -73,13 +75,13 @@ def run(options: Sequence[str]) -> int:
 
 def resume_command(config: TrainConfig) -> str:
     """The command that goes on with a run, or with all seeds: with what was said since the run began, too."""
-    words: list[Any] = ["segvisrl", "train", "--resume", "--runs-dir", config.runs_dir, "--run", config.run_name]
+    words: list[Any] = ["train", "--resume", "--runs-dir", config.runs_dir, "--run", config.run_name]
     if config.num_seeds > 1:
         words += ["--seed", config.seed, "--num-seeds", config.num_seeds]
     began = (config.resume and _stored_config(config.runs_dir, config.runs[0].run_name)) or config
     now, then = (flatten(to_dict(one)) for one in (config, began))
     words += [word for name in SAID_AGAIN if now[name] != then[name] for word in option_words(name, now[name])]
-    return shlex.join(map(str, words))
+    return f"{program()} {shlex.join(map(str, words))}"
 
 
 def _end_now(said: str) -> None:
@@ -94,23 +96,26 @@ def _end_now(said: str) -> None:
 def parse_config(options: Sequence[str]) -> TrainConfig:
     """The resolved settings: preset, then options; a run that goes on starts from its own settings instead."""
     words = _without_auto([word for option in options for word in _as_tyro_reads(option)])
-    arch, preset = _value(words, "--arch", "cnn_lstm"), _value(words, "--preset", "auto")
+    arch, preset = _value(words, "--arch", "cnn_lstm"), _value(words, "--preset", AUTO)
     if "--resume" in words:
         runs_dir, name = _value(words, "--runs-dir", "runs"), _value(words, "--run", "")
         if _value(words, "--num-seeds", "1") != "1":
             name += f"-seed{_value(words, '--seed', '0')}"  # the first of them; the option itself takes its place
         base = _stored_config(runs_dir, name)
         if base is not None:
-            return parse(TrainConfig, words, "train", base)
-    require(words[-1:] != ["--preset"], "--preset", "nothing", "followed by auto, or a preset's name")
-    if preset == "auto":
+            asked, should = _value(words, "--arch", base.arch), f"{base.arch!r}, as when {name} was started"
+            require(asked == base.arch, "arch", asked, should)  # else its other settings would be told not to fit
+            return parse(TrainConfig, words, "train", base, with_auto())
+    require(words[-1:] != ["--preset"], "--preset", "nothing", "followed by one of " + ", ".join(PRESETS))
+    require(preset in PRESETS, "--preset", preset, "one of " + ", ".join(PRESETS))
+    if preset == AUTO:
         should = "named where processes train together, e.g. gpu"
-        require("--coordinator" not in words, "preset", "auto", should)  # JAX is not to be asked before they have met
+        require("--coordinator" not in words, "--preset", AUTO, should)  # JAX is not to be asked before they have met
         preset = preset_for_this_machine()
     base = preset_config(arch, preset)
     if "--env.scene.num-rocks" in words and "--env.scene.random-num-rocks-max" not in words:
         base = replace_fields(base, random_num_rocks_max=0, rocks=None)  # what is said counts, not the preset's choice
-    return parse(TrainConfig, words, "train", base)
+    return parse(TrainConfig, words, "train", base, with_auto())
 
 
 def _stored_config(runs_dir: str, run_name: str) -> TrainConfig | None:
@@ -151,7 +156,7 @@ def _value(words: Sequence[str], option: str, default: str) -> str:
 
 def _without_auto(words: list[str]) -> list[str]:
     """Without ``--preset auto``: it means that none is said, where it comes last, and nothing where another does."""
-    dropped = ("auto",) if _value(words, "--preset", "") != "auto" else (*get_args(PresetName), "auto")
+    dropped = (AUTO,) if _value(words, "--preset", "") != AUTO else PRESETS
     places = [i for i, word in enumerate(words[:-1]) if word == "--preset" and words[i + 1] in dropped]
     return [word for i, word in enumerate(words) if i not in places and i - 1 not in places]
 
@@ -261,12 +266,12 @@ def _finish(config: TrainConfig, run_dir: Path) -> list[str]:
         video: lambda: demo.record(demo.DemoOptions(run=run_dir, output=video)),
     }
     failed = _not_made(made)
-    named = shlex.quote(str(run_dir))
+    named = f"--run {shlex.quote(str(run_dir))}"
     with output_may_fail():  # other seeds may wait for theirs
         for path in (run_dir / "config.json", run_dir / "metrics.jsonl", *made, run_dir / "policy"):
             if path not in failed:
                 print(f"  {path}{os.sep if path.is_dir() else ''}")
-        print(f"Next: segvisrl eval --run {named} --episodes 1000    or    segvisrl demo --run {named} --scene 1")
+        print(f"Next:\n  {program()} eval {named} --episodes 1000\n  {program()} demo {named} --scene 1")
     return list(failed.values())
 
 

@@ -5,10 +5,13 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from segvisrl_jax.assets import DEFAULT_POLICY
 from segvisrl_jax.cli import parse
+from segvisrl_jax.commands.options import RunFolder
 from segvisrl_jax.config import ConfigError, require
 
 
@@ -16,15 +19,16 @@ from segvisrl_jax.config import ConfigError, require
 class ViewOptions:
     """Opens a page in which a policy, or you, drive one scene, until Ctrl-C."""
 
-    run: Path | None = None
-    """A run's folder: its best policy drives."""
-    policy: str | None = None
-    """A policy's folder, or the name of a shipped one. Default: cnn_lstm."""
+    run: RunFolder | None = None
+    """A run's folder, or its name in runs/: its best policy drives."""
+    policy: Annotated[str | None, tyro.conf.arg(help_behavior_hint=f"(default: {DEFAULT_POLICY})")] = None
+    """A policy's folder, or the name of a shipped one."""
     scene: int = 0
     """Number of the scene, as for `segvisrl demo`."""
     num_rocks: int | None = None
+    """Rocks on the map; default: env.scene.num_rocks of the policy's settings."""
     port: int = 8080
-    """0 takes any free one."""
+    """Of the page; 0 takes any free one."""
     host: str = "127.0.0.1"
     """The address to listen on. Whoever can reach it can drive: 0.0.0.0 lets in the whole network."""
 

@@ -30,8 +30,10 @@ from segvisrl_jax.config.paths import (
     is_disk_trouble,
     require_file_can_be_written,
     require_folder_can_be_made,
+    run_folder,
 )
 from segvisrl_jax.config.presets import preset_config
+from segvisrl_jax.config.program import program
 from segvisrl_jax.config.tree import flatten, from_dict, option_words, replace_fields, to_dict
 
 __all__ = [
@@ -65,10 +67,12 @@ __all__ = [
     "one_line",
     "option_words",
     "preset_config",
+    "program",
     "read_json",
     "replace_fields",
     "require",
     "require_file_can_be_written",
     "require_folder_can_be_made",
+    "run_folder",
     "to_dict",
 ]

@@ -125,8 +125,11 @@ class TaskConfig:
     progress_reward_per_m: float = 100.0
     """Reward per metre towards the goal, and minus that per metre away from it (paper)."""
     collision_reward: float = -100.0
+    """For coming too near to a rock (paper)."""
     fall_reward: float = -100.0
+    """For leaving the map or tipping over (paper)."""
     timeout_reward: float = -20.0
+    """For reaching the time limit (paper)."""
 
     @property
     def num_judgements(self) -> int:
@@ -189,9 +192,13 @@ class CameraConfig:
     """The camera (a RealSense D435, paper section III-A) and how far its image is shrunk."""
 
     width_px: int = 1920
+    """Columns of the image before it is shrunk (paper)."""
     height_px: int = 1080
+    """Its rows (paper)."""
     horizontal_fov_deg: float = 69.4
+    """Field of view; the vertical one follows from it, for square pixels."""
     near_m: float = 0.01
+    """What is nearer is not drawn."""
     far_m: float = 20.0
     """What lies beyond is space."""
     scale: float = 10.0

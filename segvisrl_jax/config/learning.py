@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from segvisrl_jax.config.checks import LONGEST_NAME_BYTES, ConfigError, require, require_choice, require_types
 from segvisrl_jax.config.environment import EnvConfig
 from segvisrl_jax.config.names import ARCH_OBSERVATION, Arch, LoggerName, PresetName
-from segvisrl_jax.config.paths import A_PATH, is_path
+from segvisrl_jax.config.paths import A_PATH, RUNS_DIR, is_path
 
 LARGEST_BATCH = 10**8  # decisions: beyond it, images of any size fill every memory
 MOST_DEVICES = 2**16
@@ -66,17 +66,17 @@ class PPOConfig:
     final_learning_rate_share: float = 0.05
     """The rate falls linearly to this share of itself at the end (paper: 1, constant)."""
     discount: float = 0.97
-    """Per decision (paper: 0.85)."""
+    """What a reward is worth one decision later, its gamma (paper: 0.85)."""
     gae_lambda: float = 0.95
-    """(paper: 0.95)."""
+    """The lambda of generalised advantage estimation: 1 waits for returns, 0 trusts values (paper: 0.95)."""
     clip_epsilon: float = 0.2
-    """(paper: 0.2)."""
+    """How far a decision's probability may move, as a ratio, before its gradient is cut (paper: 0.2)."""
     entropy_cost: float = 0.006
-    """(paper: 0.01)."""
+    """Weight of the entropy, which keeps actions random, in the loss (paper: 0.01)."""
     value_cost: float = 0.5
-    """(paper: 0.5)."""
+    """Weight of the value's squared error in the loss (paper: 0.5)."""
     max_gradient_norm: float = 0.5
-    """(paper: 0.5)."""
+    """Gradients longer than this are shortened to it (paper: 0.5)."""
     reward_scale: float = 0.01
     """Rewards are multiplied by this before learning (paper: 1)."""
     normalize_advantage: bool = True
@@ -156,19 +156,21 @@ BOOKKEEPING = (
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """One training run."""
+    """One training run: which policy learns, in which world and how, for how long, and where it is written."""
 
     arch: Arch = "cnn_lstm"
     """cnn_lstm, cnn: segmented images, with and without memory; cnn_lstm_raw: colour images; mlp: the true state;
     mlp_rocks: the true state and the nearest rocks."""
     preset: PresetName = "cpu"
-    """Where the defaults come from: auto, if not said, is gpu where JAX has an accelerator, else cpu."""
+    """Where the other defaults come from. paper: the paper's settings; cpu, gpu: tuned ones; smoke: everything once,
+    tiny; auto, if not said: gpu where JAX has an accelerator, else cpu."""
     seed: int = 0
+    """Of the first parameters, of training and validation scenes, and of all that is drawn; not of test scenes."""
     steps: int = 327_680
     """Training decisions in all (rounded up to whole updates)."""
     run: str = ""
     """Name of the run's folder; empty: made from arch, preset and seed."""
-    runs_dir: str = "runs"
+    runs_dir: str = RUNS_DIR
     """Where run folders go."""
     resume: bool = False
     """Go on from the run folder's last checkpoint."""
@@ -186,6 +188,7 @@ class TrainConfig:
     process_id: int = 0
     """Which of them this is, from 0."""
     checkpoint_every_updates: int = 8
+    """Updates between two saves of everything that --resume needs."""
     max_bad_updates: int = 10
     """Updates in a row with a loss or gradient that is not finite (such steps are skipped), after which a run stops."""
     loggers: tuple[LoggerName, ...] = ()
@@ -229,7 +232,10 @@ class TrainConfig:
         self._require_even_shares()
         is_name = "/" not in self.run and self.run not in (".", "..") and self.run == self.run.strip()
         is_name = is_name and len(self.run.encode()) <= LONGEST_NAME_BYTES
-        require(is_name, "run", self.run, f"a folder's name without slashes, at most {LONGEST_NAME_BYTES} bytes long")
+        should = (
+            f"a folder's name without slashes, at most {LONGEST_NAME_BYTES} bytes long; --runs-dir says where it is"
+        )
+        require(is_name, "run", self.run, should)
         require(len(self.runs_dir) > 0, "runs_dir", self.runs_dir, "a folder; . is this one")
         for name in ("runs_dir", "start_from"):
             require(is_path(getattr(self, name)), name, getattr(self, name), A_PATH)

@@ -1,6 +1,6 @@
 """Whether something can be written where a user asks for it, said before hours of work rather than after them.
 
-And what to call it where a disk fails later all the same.
+And what to call it where a disk fails later all the same, and where a run is that is called by its name.
 """
 
 import errno
@@ -11,6 +11,7 @@ from segvisrl_jax.config.checks import is_plain_text, require
 
 LONGEST_PART_BYTES = 255  # of a path, on the file systems in use
 PARTIAL = ".partial"  # what a file's name ends in while it is written
+RUNS_DIR = "runs"  # where run folders go if nothing else is said
 A_PATH = f"a path without control characters, whose parts have at most {LONGEST_PART_BYTES} bytes"
 
 DISK_TROUBLE = (
@@ -35,6 +36,12 @@ def _has_working_folder() -> bool:
     except OSError:
         return False
     return True
+
+
+def run_folder(path: Path | str) -> Path:
+    """The folder itself; or that of this name in ``runs/``, where only that one exists."""
+    named = Path(RUNS_DIR) / path
+    return named if not os.path.isdir(path) and os.path.isdir(named) else Path(path)
 
 
 def is_path(text: str) -> bool:

@@ -134,7 +134,7 @@ class RoverEnv(Env):
 
     def step(self, state: State, action: Action) -> State:
         """One decision. ``done`` is terminated or truncated; ``info["truncation"]`` tells the two apart."""
-        rover, result = self.advance(state.pipeline_state, action)
+        rover, result = self.advance(state.pipeline_state, jnp.asarray(action, jnp.float32))  # a list, too
         done = jnp.maximum(result.terminated, result.truncated)
         metrics = {**state.metrics, **_metrics(result, rover.outcome)}
         info = {**state.info, "truncation": result.truncated}

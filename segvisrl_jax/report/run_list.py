@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from segvisrl_jax.config import is_finite, is_plain_text, one_line, read_json, require
+from segvisrl_jax.config import is_finite, is_plain_text, one_line, program, read_json, require
 from segvisrl_jax.training.loggers import METRICS_FILE, STEP_KEY
 from segvisrl_jax.training.metrics_rows import MOST_DECISIONS, read_rows
-from segvisrl_jax.training.run_lock import is_being_trained
+from segvisrl_jax.training.run_lock import is_being_trained, was_locked_here
 
 State = Literal["finished", "running", "stopped"]
 CONFIG_FILE, TEST_FILE = "config.json", "eval.json"
@@ -104,7 +104,7 @@ def _why_no_run(path: Path) -> str:
     if (path / "policy" / "policy.json").is_file() or (path / "policy.json").is_file():
         return "a policy without its run (no config.json)"
     num_runs = len(list(path.glob(f"*/{CONFIG_FILE}")))
-    return f"no run, but {num_runs} inside: segvisrl runs {path}" if num_runs else "no run (no config.json)"
+    return f"no run, but {num_runs} inside: {program()} runs {path}" if num_runs else "no run (no config.json)"
 
 
 def _summary(name: str, path: Path, test: Score | None) -> RunSummary:
@@ -160,15 +160,16 @@ def _text(data: dict[str, Any], name: str) -> str:
 
 
 def _state(path: Path, rows: list[dict[str, Any]], done: int, asked: int, per_update: int, changed_s: float) -> State:
-    """Running: a process of this machine holds its folder, or its last line is fresh and no end has been saved.
+    """Running: a process of this machine holds its folder; or one of another machine may, whose lock is not seen here.
 
-    The second is for runs on another machine whose folder is shared. A run that ends early saves a checkpoint behind
-    its last line, and so cannot be taken for a running one.
+    Then its last line is fresh and no end has been saved: a run that ends early saves a checkpoint behind that line.
     """
     if is_being_trained(path):
         return "running"
     if done >= asked:
         return "finished"
+    if was_locked_here(path):
+        return "stopped"
     speeds = [row["time/decisions_per_second"] for row in rows[-RECENT_LINES:] if row.get("time/decisions_per_second")]
     update_s = per_update / statistics.median(speeds) if speeds else 0.0
     is_fresh = time.time() - changed_s < max(LEAST_PATIENCE_S, PATIENCE_UPDATES * update_s)

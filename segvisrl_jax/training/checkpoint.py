@@ -18,7 +18,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from segvisrl_jax.assets import asset_dir
-from segvisrl_jax.config import ConfigError, TrainConfig, from_dict, read_json, to_dict
+from segvisrl_jax.config import ConfigError, TrainConfig, from_dict, read_json, run_folder, to_dict
 from segvisrl_jax.cpu import make_callbacks_safe
 from segvisrl_jax.training.manifest import (
     MANIFEST,
@@ -359,8 +359,10 @@ def _find_policy(folder: Path) -> Path:
     is_bare_name = len(folder.parts) == 1 or folder.parts[:-1] == ("pretrained",)
     if is_bare_name and (shipped / "policy.json").is_file():
         return shipped
-    known = sorted(p.parent.name for p in asset_dir("pretrained").glob("*/policy.json"))
-    raise ConfigError(f"policy = {str(folder)!r}: should be a folder with policy.json, or one of {known}")
+    known = ", ".join(sorted(p.parent.name for p in asset_dir("pretrained").glob("*/policy.json")))
+    inside = run_folder(folder) / "policy"
+    hint = f"; this is a run, and {inside} its policy" if (inside / "policy.json").is_file() else ""
+    raise ConfigError(f"policy = {str(folder)!r}: should be a folder with policy.json, or one of {known}{hint}")
 
 
 def _leaves(params: dict[str, Any], path: tuple[str, ...] = ()):

@@ -5,15 +5,18 @@ A policy is data (``params``) and two pure functions, so that an evaluation comp
 
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float32, PRNGKeyArray
 
-from segvisrl_jax.agent.networks import Network
-from segvisrl_jax.config import EnvConfig
+from segvisrl_jax.agent.networks import Network, Params, make_network
+from segvisrl_jax.config import EnvConfig, TrainConfig, require
 from segvisrl_jax.env.pose import yaw_rad
+from segvisrl_jax.env.rover_env import observation_shape
+from segvisrl_jax.training.checkpoint import load_policy
 from segvisrl_jax.types import Action, Observation, RoverState
 
 Carry = Any
@@ -84,6 +87,36 @@ def network_policy(network: Network, name: str) -> Policy:
         return carry, output.mean
 
     return Policy(name, observes=True, initial_carry=lambda num_envs: network.initial_carry((num_envs,)), act=act)
+
+
+def load_network(folder: Path) -> tuple[TrainConfig, Network, Params]:
+    """A policy's settings, its network, and its parameters, which fit.
+
+    Args:
+        folder: or the name of a shipped policy, as for ``checkpoint.load_policy``.
+
+    Raises:
+        ConfigError: where it is missing or damaged; the message names the file.
+    """
+    config, params, _ = load_policy(folder)
+    network = make_network(config.arch, config.network, observation_shape(config.env))
+    _require_parameters_that_fit(params, network, folder)
+    return config, network, params
+
+
+def _require_parameters_that_fit(params: Params, network: Network, folder: Path) -> None:
+    """A policy's folder may have been put together by hand."""
+    needed = jax.eval_shape(network.init, jax.random.key(0))
+    ours, theirs = (
+        {jax.tree_util.keystr(path): leaf.shape for path, leaf in _leaves(tree)} for tree in (params, needed)
+    )
+    for name in sorted(ours.keys() | theirs.keys()):
+        should = f"of shape {theirs[name]}, as its settings have it" if name in theirs else "left out"
+        require(ours.get(name) == theirs.get(name), f"{folder}: {name}", ours.get(name), should)
+
+
+def _leaves(tree: Any) -> list[tuple[Any, Any]]:
+    return jax.tree_util.tree_flatten_with_path(tree)[0]
 
 
 def goal_bearing_rad(rover: RoverState) -> Float32[Array, ""]:

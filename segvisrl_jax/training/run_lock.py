@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import platform
 import time
 from pathlib import Path
 from typing import IO
@@ -9,6 +10,7 @@ from typing import IO
 from segvisrl_jax.config import ConfigError
 
 LOCK_FILE = "lock"
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # Linux: names the running kernel, whatever a container calls itself
 TRIES, TRY_EVERY_S = 6, 0.1  # who only looks (``is_being_trained``) holds it for a moment
 
 
@@ -51,10 +53,11 @@ def _locked_file(run_dir: Path) -> IO[bytes]:
     Raises:
         ConfigError: where another process holds it.
     """
-    file = (run_dir / LOCK_FILE).open("wb")
+    file = (run_dir / LOCK_FILE).open("ab", buffering=0)
     for tries_left in reversed(range(TRIES)):
         try:
-            _lock(file, exclusive=True)
+            is_locked = _lock(file, exclusive=True)
+            _write(file, _kernel() if is_locked else b"")
             return file
         except BlockingIOError:
             if tries_left:
@@ -75,14 +78,39 @@ def is_being_trained(run_dir: Path) -> bool:
     return False
 
 
-def _lock(file: IO[bytes], exclusive: bool) -> None:
-    """Locks, or raises BlockingIOError."""
+def was_locked_here(run_dir: Path) -> bool:
+    """Whether the last process that held the run's folder ran under this kernel: its lock would be seen here."""
+    try:
+        return (Path(run_dir) / LOCK_FILE).read_bytes() == _kernel()
+    except OSError:
+        return False
+
+
+def _write(file: IO[bytes], content: bytes) -> None:
+    with contextlib.suppress(OSError):  # a full disk costs no training
+        file.truncate(0)
+        file.write(content)
+
+
+def _kernel() -> bytes:
+    """Of this machine, since it was started; elsewhere than on Linux the machine's name."""
+    return BOOT_ID.read_bytes() if BOOT_ID.exists() else platform.node().encode()
+
+
+def _lock(file: IO[bytes], exclusive: bool) -> bool:
+    """Locks; False where there are no locks.
+
+    Raises:
+        BlockingIOError: where another process holds it.
+    """
     with contextlib.suppress(ImportError):
         import fcntl
 
         try:
             fcntl.flock(file, (fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+            return True
         except BlockingIOError:
             raise
         except OSError:
-            return
+            pass
+    return False

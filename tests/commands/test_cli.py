@@ -1,8 +1,10 @@
 """The program as a user types it: what it prints, what it leaves, and one line for every mistake."""
 
 import errno
+import itertools
 import json
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -11,10 +13,16 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from segvisrl_jax.cli import main
+from segvisrl_jax.cli import COMMANDS, main, parse
 from segvisrl_jax.commands import doctor
+from segvisrl_jax.commands.demo import DemoOptions
+from segvisrl_jax.commands.eval import EvalOptions
+from segvisrl_jax.commands.export import ExportOptions
+from segvisrl_jax.commands.report import ReportOptions
+from segvisrl_jax.commands.runs import RunsOptions
 from segvisrl_jax.commands.train import parse_config, resume_command, rocks_in_scenes
-from segvisrl_jax.config import NotWrittenError, preset_config, replace_fields, to_dict
+from segvisrl_jax.commands.view import ViewOptions
+from segvisrl_jax.config import ConfigError, NotWrittenError, preset_config, replace_fields, to_dict
 from segvisrl_jax.cpu import num_cores
 from segvisrl_jax.training.run import open_run_dir
 
@@ -36,7 +44,8 @@ def segvisrl(*words, cwd):
     [
         (["fly"], ["'fly'", "train", "eval"]),
         (["train", "--arch", "resnet"], ["arch", "resnet", "cnn_lstm_raw"]),
-        (["train", "--preset", "huge"], ["preset", "huge", "smoke"]),
+        (["train", "--preset", "huge"], ["--preset", "huge", "one of auto, paper, cpu, gpu, smoke"]),
+        (["train", "--preset"], ["--preset", "followed by one of auto,"]),
         (["train", "--env.camera.scale", "-2"], ["scale", "-2", "1 or more"]),
         (["train", "--env.camera.scale", "600"], ["scale", "600", "at least 4 pixels"]),
         (["train", "--env.scene.num-rocks", "60", "--env.scene.rock-radius-max-m", "2"], ["num_rocks", "60", "2.0 m"]),
@@ -49,7 +58,9 @@ def segvisrl(*words, cwd):
         (["train", "--env.renderer", "crayon"], ["--env.renderer", "crayon", "scanline"]),
         (["train", "--env.physics.engine", "bullet"], ["bullet", "native"]),
         (["train", "--resume", "--run", "nothing"], ["nothing", "no checkpoint"]),
-        (["eval"], ["--run, --policy, --controller", "exactly one"]),
+        (["eval"], ["--run, --policy, --controller", "exactly one, as in --policy cnn_lstm"]),
+        (["eval", "cnn_lstm"], ["cnn_lstm", "should be left out, or follow an option"]),
+        (["train", "--resume", "--run", "runs/x"], ["'runs/x'", "without slashes", "--runs-dir"]),
         (["eval", "--controller", "p", "--policy", "x"], ["exactly one"]),
         (["eval", "--controller", "q"], ["--controller", "q"]),
         (["eval", "--controller", "p", "--episodes", "0"], ["--episodes", "0"]),
@@ -93,10 +104,25 @@ def test_a_mistake_ends_the_program_so_too(tmp_path):
 
 
 def test_help_lists_the_commands_and_their_options(tmp_path):
-    assert "train" in segvisrl("--help", cwd=tmp_path).stdout
+    for word in ("--help", "help"):
+        assert "train" in segvisrl(word, cwd=tmp_path).stdout
     options = segvisrl("train", "--help", cwd=tmp_path)
     assert options.returncode == 0
     assert "--env.camera.scale" in options.stdout
+    assert "--preset {auto,paper,cpu,gpu,smoke}" in options.stdout
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_every_option_is_explained(command, capsys):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    lines = [line.strip(" │") for line in capsys.readouterr().out.splitlines()]
+    assert any(line.startswith("-h, --help") for line in lines)
+    values = r"(\{.*?\}|\[.*?\]\]?|[A-Z]+|\|)*"  # metavar
+    options = [(line, after) for line, after in itertools.pairwise(lines) if line.startswith("--")]
+    for line, after in options:
+        explained = re.sub(rf"^--\S+ {values}", "", line).strip() or after
+        assert not explained.startswith("("), f"{command}: {line}"
 
 
 def test_a_reader_that_has_had_enough_is_no_failure(tmp_path):
@@ -166,7 +192,7 @@ def test_train_eval_demo_as_a_user_does(arch, tmp_path):
     assert "differs from the paper's settings" in trained.stdout
     run = tmp_path / "runs" / f"{arch}-smoke-seed0"
     require_files_of(run)
-    assert f"segvisrl eval --run runs/{run.name}" in trained.stdout
+    assert f"-m segvisrl_jax eval --run runs/{run.name}" in trained.stdout
 
     again = segvisrl("train", "--arch", arch, *SMOKE, cwd=tmp_path)
     assert again.returncode == 2
@@ -316,6 +342,8 @@ def test_a_run_that_was_moved_goes_on_where_it_is(tmp_path, monkeypatch):
     goes_on = parse_config(["--resume", "--run", "moved"])
     assert (goes_on.runs_dir, goes_on.run, goes_on.seed) == ("runs", "moved", 3)
     assert resume_command(goes_on) == "segvisrl train --resume --runs-dir runs --run moved"
+    with pytest.raises(ConfigError, match="arch = 'cnn': should be 'mlp', as when moved was started"):
+        parse_config(["--resume", "--run", "moved", "--arch", "cnn"])
     longer = parse_config(["--resume", "--run", "moved", "--steps", "99999", "--loggers", "wandb", "mlflow"])
     assert parse_config(shlex.split(resume_command(longer))[2:]) == longer
 
@@ -359,3 +387,26 @@ def test_the_command_that_goes_on_with_seeds_means_all_of_them(tmp_path):
         open_run_dir(each)
     goes_on = parse_config(shlex.split(resume_command(together))[2:])
     assert goes_on == replace_fields(together, resume=True)
+
+
+@pytest.mark.parametrize("word", ["mine", "runs/mine"])
+def test_a_run_that_is_taken_for_a_policy_is_said_to_be_one(word, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    policy = Path("runs/mine/policy/policy.json")
+    policy.parent.mkdir(parents=True)
+    policy.touch()
+    assert main(["eval", "--policy", word]) == 2
+    assert f"policy = '{word}'" in (said := capsys.readouterr().err)
+    assert "; this is a run, and runs/mine/policy its policy" in said
+
+
+@pytest.mark.parametrize(("word", "found"), [("mine", "runs/mine"), ("runs/mine", "runs/mine"), ("here", "here")])
+def test_a_run_in_runs_is_known_by_its_name(word, found, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for folder in ("runs/mine", "runs/here", "here"):
+        Path(folder).mkdir(parents=True)
+    for command, kind in (("eval", EvalOptions), ("demo", DemoOptions), ("view", ViewOptions)):
+        assert parse(kind, ["--run", word], command).run == Path(found)
+    assert parse(ExportOptions, ["--format", "onnx", "--run", word], "export").run == Path(found)
+    assert parse(ReportOptions, [word, "nowhere"], "report").runs == (Path(found), Path("nowhere"))
+    assert parse(RunsOptions, [word], "runs").folder == Path(found)

@@ -173,6 +173,8 @@ def test_a_signal_to_the_sweep_alone_stops_its_trainings_in_order(number, tmp_pa
         (["--vary", "scale=20,0.1"], "scale0.1: camera.scale = 0.1: should be 1 or more"),
         (["--jobs", "0"], "--jobs = 0: should be in [1, 1024]"),
         (["--args=--no-such-option"], "no-such-option"),
+        (["--args", "--no-such-option 3"], "--no-such-option, 3: should be left out"),
+        (["--args"], "--args = nothing: should be followed by a value"),
         (["--cpus-per-run", "0"], "--cpus-per-run"),
     ],
 )

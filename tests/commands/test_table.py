@@ -287,10 +287,17 @@ def test_half_a_file_and_no_file_are_refused_by_their_names(folder, capsys, tmp_
     assert str(tmp_path / "none.json") in refusal(capsys, tmp_path / "none.json")
 
 
+def test_a_folder_of_runs_is_told_where_their_evaluations_are(tmp_path, capsys):
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "eval.json").touch()
+    assert main(["table", str(tmp_path)]) == 2
+    assert f"{tmp_path}: holds no evaluation; {tmp_path}/*/eval.json are those of runs" in capsys.readouterr().err
+
+
 def test_nothing_to_read_and_nowhere_to_write(folder, capsys, tmp_path):
     assert "at least one file" in refusal(capsys)
     for empty in (tmp_path, tmp_path / "missing"):
-        assert f"{empty}: holds no evaluation yet" in refusal(capsys, empty)
+        assert f"{empty}: holds no evaluation; segvisrl eval" in refusal(capsys, empty)
     for output in (folder / "p.json", tmp_path / "missing" / "x.md"):
         assert str(output) in refusal(capsys, folder / "p.json", "--output", output)
 

@@ -210,6 +210,14 @@ def test_an_action_of_another_shape_is_refused(shape):
         jax.eval_shape(env.step, state, jax.ShapeDtypeStruct(shape, jnp.float32))
 
 
+def test_an_action_may_be_a_list():
+    env = make(obs="state")
+    state, step = jax.jit(env.reset)(jax.random.key(0)), jax.jit(env.step)
+    wanted = step(state, jnp.array([0.5, 1.0]))
+    for action in ([0.5, 1.0], np.array([0.5, 1.0])):
+        np.testing.assert_array_equal(step(state, action).obs, wanted.obs)
+
+
 def test_diverged_physics_never_reaches_the_observation():
     env = make("state")
     rover = jax.jit(env.initial_state)(jax.random.key(7))

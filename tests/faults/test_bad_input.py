@@ -76,7 +76,7 @@ COMMAND_CASES: list[tuple[list[str], str, str]] = [  # words, the field that is 
     *[(["demo", "--output", value], "--output", value) for value in ("x.avi", "mp4", "", "no/x.mp4", "folder.mp4")],
     (["demo", "--output", f"{LONG_NAME}.mp4"], "--output", LONG_NAME),
     (["demo", "--gif", "--output", "film.mp4"], "--output", "film.gif"),
-    (["export"], "format", "required"),
+    (["export"], "--format", "nothing"),
     (["export", "--format", "torch", "--policy", "cnn"], "--format", "torch"),
     (["export", "--format", "stablehlo"], "--run, --policy", "none given"),
     (["export", "--format", "stablehlo", "--policy", "cnn", "--run", "run"], "--run, --policy", "--run and --policy"),

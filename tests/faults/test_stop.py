@@ -76,7 +76,7 @@ def test_between_updates_all_of_them_are_saved(number, tmp_path):
     assert (code, seconds < ENDS_WITHIN_S) == (130, True), (code, seconds, said)
     decisions = read_metrics(training.run)[-1]["step"]
     assert f"Stopped and saved after {decisions:,} decisions. Go on with:\n" in said
-    assert said.rstrip().endswith(f"segvisrl train --resume --runs-dir {tmp_path} --run run")
+    assert said.rstrip().endswith(f"-m segvisrl_jax train --resume --runs-dir {tmp_path} --run run")
     assert "Traceback" not in said
 
 
@@ -90,7 +90,7 @@ def test_what_takes_too_long_is_left(options, lines, tmp_path):
     seconds, code, said = training.stop(signal.SIGTERM)
     assert (code, seconds < ENDS_WITHIN_S) == (130, True), (code, seconds, said)
     assert "Stopped" in said
-    assert said.rstrip().endswith(f"segvisrl train --resume --runs-dir {tmp_path} --run run")
+    assert said.rstrip().endswith(f"-m segvisrl_jax train --resume --runs-dir {tmp_path} --run run")
     if lines:
         [saved] = re.findall(r"saved are ([\d,]+) decisions", said)
         assert int(saved.replace(",", "")) == read_metrics(training.run)[-1]["step"]
@@ -121,7 +121,7 @@ def test_after_the_last_update_the_training_is_complete(number, tmp_path):
     seconds, code, said = training.stop(number)
     assert (code, seconds < ENDS_WITHIN_S) == (130, True), (code, seconds, said)
     assert "The training is complete and saved. Its evaluation, curve and video are made with:\n" in said
-    assert said.rstrip().endswith(f"segvisrl train --resume --runs-dir {tmp_path} --run run")
+    assert said.rstrip().endswith(f"-m segvisrl_jax train --resume --runs-dir {tmp_path} --run run")
     assert "Traceback" not in said
     assert not (training.run / "rollout.mp4").exists()
 

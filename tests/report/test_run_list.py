@@ -9,7 +9,7 @@ import pytest
 
 from segvisrl_jax.config import preset_config, replace_fields, to_dict
 from segvisrl_jax.report.run_list import Complaint, list_runs
-from segvisrl_jax.training.run_lock import RunLock
+from segvisrl_jax.training.run_lock import LOCK_FILE, RunLock
 
 OLD_S = 7200.0
 
@@ -58,6 +58,16 @@ def test_a_run_that_a_process_writes_is_running_and_then_is_not(tmp_path):
     with contextlib.closing(RunLock(run)):
         assert state_of(tmp_path) == "running"
     assert state_of(tmp_path) == "stopped"
+
+
+def test_a_fresh_run_that_ended_before_its_first_save_is_stopped(tmp_path):
+    run = make_run(tmp_path, "a", [], age_s=0)
+    assert state_of(tmp_path) == "running"  # for all that is known: nobody locked it
+    for _ in range(2):
+        RunLock(run).close()
+        assert state_of(tmp_path) == "stopped"
+    (run / LOCK_FILE).write_bytes(b"of another machine")
+    assert state_of(tmp_path) == "running"
 
 
 def test_on_another_machine_a_fresh_run_is_running_until_its_end_is_saved(tmp_path):

@@ -34,7 +34,7 @@ def test_lines_are_medians_over_seeds_at_their_places(tmp_path, drawn):
     success, speed = drawn[0].axes
     assert [label.get_text() for label in success.get_xticklabels()] == ["5", "40"]
     assert [text.get_text() for text in speed.get_legend().get_texts()] == ["cnn", "cnn_lstm"]
-    means = next(line for line in speed.lines if line.get_label() == "cnn")
+    means = next(line for line in speed.lines if line.get_linestyle() == "-")
     np.testing.assert_allclose(means.get_ydata(), [50, 110])
     np.testing.assert_allclose(means.get_xdata(), [-0.06, 0.94])
     heights = [line.get_ydata() for line in success.lines]
@@ -47,6 +47,17 @@ def test_settings_without_numbers_are_places_too(tmp_path, drawn):
     success, speed = drawn[0].axes
     assert [label.get_text() for label in success.get_xticklabels()] == ["cnn", "mlp"]
     assert speed.get_legend() is None
+
+
+def test_lines_beyond_the_colours_are_told_apart(tmp_path, drawn):
+    rows = [row(0.5, 10 * n, scale=scale, rate=f"{n}") for n in range(28) for scale in ("20", "40")]
+    sweep_figure(rows, ["scale", "rate"], tmp_path / "sweep.png")
+    success, speed = drawn[0].axes
+    shown = speed.get_legend().get_lines()
+    assert len({(line.get_color(), line.get_linestyle(), line.get_marker()) for line in shown}) == 28
+    for axes in (success, speed):
+        joined = [line for line in axes.lines if line.get_linestyle() != "None" and len(line.get_xdata()) == 2]
+        assert len({(line.get_color(), line.get_linestyle()) for line in joined}) == 28
 
 
 def test_nothing_finished_is_said(tmp_path):
