@@ -5,7 +5,10 @@ Axes: ``T`` time, ``B`` environments, ``H`` rows, ``W`` columns, ``C`` channels,
 ground; SI units. This file owns data, no behaviour beyond trivial derived values.
 """
 
+import dataclasses
 import enum
+import functools
+import operator
 
 import numpy as np
 from flax import struct
@@ -116,7 +119,11 @@ class RewardTerms:
 
     def total(self) -> Float32[Array, "*B"]:
         """The sum of all terms."""
-        return self.progress + self.collision + self.fall + self.timeout
+        return functools.reduce(operator.add, self.by_name().values())
+
+    def by_name(self) -> dict[str, Float32[Array, "*B"]]:
+        """The terms by the names that logs have for them."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
 
 @struct.dataclass

@@ -1,5 +1,6 @@
 """``RoverEnv``: scene, physics, task and camera composed into ``reset(key)`` and ``step(state, action)``."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -324,13 +325,12 @@ def _track(judged: PhysicsState) -> task.Track:
 
 
 def _no_reward() -> RewardTerms:
-    zero = jnp.float32(0.0)
-    return RewardTerms(zero, zero, zero, zero)
+    return RewardTerms(**{field.name: jnp.float32(0.0) for field in dataclasses.fields(RewardTerms)})
 
 
 def _metrics(result: StepResult, outcome: Int32[Array, ""]) -> dict[str, Array]:
     """brax's metrics: the same fields after reset and after step."""
-    terms = {f"reward/{name}": getattr(result.terms, name) for name in ("progress", "collision", "fall", "timeout")}
+    terms = {f"reward/{name}": term for name, term in result.terms.by_name().items()}
     ended = {
         f"outcome/{kind.name.lower()}": (outcome == kind).astype(jnp.float32)
         for kind in Outcome

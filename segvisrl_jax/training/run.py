@@ -429,8 +429,8 @@ def _finished_episodes(log: EpisodeLog) -> list[list[float]]:
 def _row(metrics: dict[str, Any], log: EpisodeLog, recent) -> dict[str, float]:
     """What one update has to say, by the names that the log file uses."""
     row = {f"ppo/{name}": float(value) for name, value in metrics.items()}
-    for name in ("progress", "collision", "fall", "timeout"):
-        row[f"reward/{name}"] = float(np.mean(jax.device_get(getattr(log.terms, name))))
+    for name, term in log.terms.by_name().items():
+        row[f"reward/{name}"] = float(np.mean(jax.device_get(term)))
     if recent:
         episodes = np.array(recent)
         for kind in OUTCOMES:
