@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from segvisrl_jax.cli import parse
-from segvisrl_jax.commands.options import RunFolder
+from segvisrl_jax.commands.options import ONE_DRIVER, RunFolder
 from segvisrl_jax.config import (
     ConfigError,
     EngineName,
@@ -21,8 +21,6 @@ from segvisrl_jax.config import (
     to_dict,
 )
 from segvisrl_jax.config.conditions import ConditionsConfig
-
-ONE_DRIVER = "exactly one, as in --policy cnn_lstm"
 
 
 @dataclass(frozen=True)

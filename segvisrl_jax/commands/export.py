@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from segvisrl_jax.cli import parse
-from segvisrl_jax.commands.options import RunFolder
+from segvisrl_jax.commands.options import ONE_DRIVER, RunFolder
 from segvisrl_jax.config import require, require_file_can_be_written
 from segvisrl_jax.export.formats import SUFFIXES, FormatName, file_format, require_packages
 
@@ -32,12 +32,7 @@ class ExportOptions:
 
     def __post_init__(self) -> None:
         given = [name for name, value in (("--run", self.run), ("--policy", self.policy)) if value]
-        require(
-            len(given) == 1,
-            "--run, --policy",
-            " and ".join(given) or "none given",
-            "exactly one, as in --policy cnn_lstm",
-        )
+        require(len(given) == 1, "--run, --policy", " and ".join(given) or "none given", ONE_DRIVER)
         require(1 <= self.scenes <= 1000, "--scenes", self.scenes, "in [1, 1000]")
         if self.output is not None:
             suffix = SUFFIXES[self.format]

@@ -11,6 +11,8 @@ AUTO = "auto"
 PRESETS = (AUTO, *get_args(PresetName))
 """What ``--preset`` takes: auto stands for one of the others."""
 
+ONE_DRIVER = "exactly one, as in --policy cnn_lstm"  # of --run, --policy and the like
+
 RunFolder = Annotated[
     Path,
     tyro.constructors.PrimitiveConstructorSpec(
