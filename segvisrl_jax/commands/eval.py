@@ -16,6 +16,7 @@ from segvisrl_jax.config import (
     EnvConfig,
     RendererName,
     TrainConfig,
+    replace_fields,
     require,
     require_file_can_be_written,
     to_dict,
@@ -40,6 +41,8 @@ class EvalOptions:
     """Names the test scenes."""
     num_rocks: int | None = None
     """Rocks on the map; default: env.scene.num_rocks of the policy's settings."""
+    random_start_yaw_share: float = 0.0
+    """Share of episodes that start at a uniformly random heading; the others face inwards, as the paper's do."""
     renderer: RendererName | None = None
     """Who draws what the policy sees; default: env.renderer of its settings."""
     physics: EngineName | None = None
@@ -54,6 +57,8 @@ class EvalOptions:
         require(1 <= self.episodes <= 10**7, "--episodes", self.episodes, "in [1, 10000000]")
         require(0 <= self.seed < 2**31, "--seed", self.seed, "in [0, 2^31)")
         require(1 <= self.slots <= 10**5, "--slots", self.slots, "in [1, 100000]")
+        share = self.random_start_yaw_share
+        require(0 <= share <= 1, "--random-start-yaw-share", share, "in [0, 1]")
 
 
 def run(options: Sequence[str]) -> int:
@@ -89,6 +94,7 @@ def evaluate(asked: EvalOptions) -> dict[str, Any]:
     policy, params, config = load_driver(asked.run, asked.policy, asked.controller)
     record = training_record(asked, params)  # now: a run that trains may have a better policy when this ends
     env_config = with_overrides(config, asked.num_rocks, asked.renderer, asked.physics, asked.conditions)
+    env_config = replace_fields(env_config, random_start_yaw_share=asked.random_start_yaw_share)
     env = RoverEnv(env_config)
     evaluator = Evaluator(env, policy, min(asked.slots, asked.episodes))
     stream = scene_stream(asked.seed, TEST_STREAM)
@@ -211,8 +217,6 @@ def with_overrides(
     config: EnvConfig, num_rocks, renderer, physics, conditions: ConditionsConfig | None = None
 ) -> EnvConfig:
     """The settings with the command line's exceptions."""
-    from segvisrl_jax.config import replace_fields
-
     shifted = conditions if conditions != ConditionsConfig() else None
     named = {"num_rocks": num_rocks, "renderer": renderer, "engine": physics, "conditions": shifted}
     return replace_fields(config, **{name: value for name, value in named.items() if value is not None})

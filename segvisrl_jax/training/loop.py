@@ -235,13 +235,19 @@ def _trainer_that_can_see(config: TrainConfig) -> Trainer:
     return trainer
 
 
+_OF_RANDOM_WEIGHTS: dict[str, Any] = {
+    "initial_std": 1.0,
+    "initial_turn": 0.0,
+}  # any values: given weights have their own
+
+
 def _params_to_start_from(config: TrainConfig) -> Params | None:
     if not config.start_from:
         return None
     source, params, _ = load_policy(Path(config.start_from))
     for name, ours, theirs in (
         ("arch", config.arch, source.arch),
-        ("network", config.network, source.network),
+        ("network", *(dataclasses.replace(one.network, **_OF_RANDOM_WEIGHTS) for one in (config, source))),
         ("observations", observation_shape(config.env), observation_shape(source.env)),
     ):
         require(ours == theirs, "start_from", config.start_from, f"a policy whose {name} is {ours}, not {theirs}")

@@ -54,7 +54,7 @@ def test_this_machine_without_measuring(tmp_path, monkeypatch, capsys):
     assert data["can_train"]
     found = {finding["name"]: finding["value"] for finding in data["findings"]}
     assert found["--preset auto"] == "cpu: JAX has no accelerator"
-    assert "491,520 decisions" in found["make train, cnn_lstm"]
+    assert "245,760 decisions" in found["make train, cnn_lstm"]
     assert not any(finding["section"] == reading.SECTION for finding in data["findings"])
 
 

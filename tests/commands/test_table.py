@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 
 from segvisrl_jax.agent.networks import make_network
@@ -345,6 +346,20 @@ def test_shifted_conditions_are_asked_for_recorded_and_not_mixed_with_others(fol
     assert parse(EvalOptions, again, "eval") == parse(EvalOptions, asked, "eval")
     line = refusal(capsys, folder / "random.json", shifted)
     assert f"{shifted}: conditions.randomize = True: should be False, as in {folder / 'random.json'}" in line
+
+
+def test_random_headings_are_asked_for_recorded_and_not_mixed_with_others(folder, tmp_path, capsys):
+    turned = tmp_path / "turned.json"
+    asked = ["--controller", "p", "--episodes", str(EPISODES), "--seed", "3", "--random-start-yaw-share", "1"]
+    assert main(["eval", *asked, "--json", str(turned)]) == 0
+    plain, data = read(folder / "p.json"), read(turned)
+    assert data["config"]["scene"] == {**plain["config"]["scene"], "random_start_yaw_share": 1}
+    assert data["per_episode"]["shortest_path_m"] == plain["per_episode"]["shortest_path_m"]
+    differ = np.subtract(data["per_episode"]["goal_bearing_deg"], plain["per_episode"]["goal_bearing_deg"])
+    assert np.all(np.abs(differ) > 0.1)
+    again = shlex.split(data["command"])[2:]
+    assert parse(EvalOptions, again, "eval") == parse(EvalOptions, asked, "eval")
+    assert f"{turned}: scene.random_start_yaw_share = 1" in refusal(capsys, folder / "random.json", turned)
 
 
 def test_the_record_of_a_thousand_episodes_is_below_100_kilobytes(folder):

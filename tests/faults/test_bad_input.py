@@ -61,6 +61,7 @@ COMMAND_CASES: list[tuple[list[str], str, str]] = [  # words, the field that is 
     (["eval", "--run"], "--run", "nothing"),
     *[([*EVAL_P, "--episodes", value], "--episodes", value) for value in ("0", "-1", "99999999", "2.5", "nan", "x")],
     *[([*EVAL_P, "--seed", value], "--seed", value) for value in ("-1", "2147483648", "x", "1.5")],
+    *[([*EVAL_P, "--random-start-yaw-share", value], "yaw-share", value) for value in ("1.1", "-0.1", "nan", "x")],
     *[([*EVAL_P, "--slots", value], "--slots", value) for value in ("0", "-8", "100001", "x")],
     *[([*EVAL_P, "--num-rocks", value], "num_rocks", value) for value in ("-1", "65", "x", "1.5")],
     ([*EVAL_P, "--renderer", "crayon"], "--renderer", "crayon"),

@@ -239,8 +239,8 @@ def test_a_probe_answers_in_a_process_of_its_own():
 def test_the_time_of_a_training_counts_all_of_it():
     config = preset_config("cnn_lstm", "cpu")
     reading = Reading(1e4, 2e3, acting_decisions_per_s=1000.0, gradient_images_per_s=2000.0, compile_s=50.0)
-    driven = math.ceil(491_520 / 40_960) * 200 + 200
-    expected = 50 + (491_520 + 70 * driven) / 1000 + 4 * 491_520 / 2000
+    driven = math.ceil(245_760 / 40_960) * 200 + 200
+    expected = 50 + (245_760 + 70 * driven) / 1000 + 4 * 245_760 / 2000
     assert training_time_s(config, reading, test_episodes=200) == pytest.approx(expected)
 
 

@@ -110,7 +110,8 @@ def stop_after(config, updates):
 def test_training_starts_from_a_policy_where_one_is_named(config, tmp_path):
     policy = str(tmp_path / "run" / "policy")
     _, params, _ = load_policy(loop.Path(policy))
-    more = replace_fields(config, start_from=policy, run="second", learning_rate=1e-9)
+    begins_otherwise = {"initial_turn": 0.3, "initial_std": 0.5}
+    more = replace_fields(config, start_from=policy, run="second", learning_rate=1e-9, **begins_otherwise)
     loop.train(more, **QUIET)
     again, moved, _ = load_policy(tmp_path / "second" / "policy")
     for a, b in zip(as_arrays(params), as_arrays(moved), strict=True):
@@ -222,7 +223,7 @@ def test_a_checkpoint_of_another_architecture_is_refused(config, tmp_path):
 
 
 def test_evaluation_starts_as_the_paper_does_whatever_training_does():
-    config = preset_config("cnn_lstm", "cpu")
+    config = preset_config("cnn_lstm_raw", "cpu")
     assert config.env.scene.random_start_yaw_share > 0
     assert loop.held_out_env(config.env).scene.random_start_yaw_share == 0
     shifted = replace_fields(config.env, randomize=True, latency_s=0.2)
