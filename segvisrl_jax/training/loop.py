@@ -235,10 +235,8 @@ def _trainer_that_can_see(config: TrainConfig) -> Trainer:
     return trainer
 
 
-_OF_RANDOM_WEIGHTS: dict[str, Any] = {
-    "initial_std": 1.0,
-    "initial_turn": 0.0,
-}  # any values: given weights have their own
+# Settings of random weights only, at any values: given weights have their own.
+_OF_RANDOM_WEIGHTS: dict[str, Any] = {"initial_std": 1.0, "initial_turn": 0.0}
 
 
 def _params_to_start_from(config: TrainConfig) -> Params | None:
