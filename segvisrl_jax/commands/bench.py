@@ -51,8 +51,9 @@ class BenchOptions:
     a training's first update. peers: PyTorch and sb3-contrib beside this project (needs the extra [sb3]). growth: time
     and memory against rocks, environments, image and unroll, one of them varied at a time; 20 to 25 minutes. Rows have
     the most memory that the process had until then, and the share of a limit that was measured beside them: of a large
-    copy (physics, render) or of a large matrix product (policy, update, train, peers)."""
-    batch: int = 32
+    copy (physics, render) or of a large matrix product (policy, update, train, peers); for physics also of what
+    mujoco.rollout, on all cores of the CPU, does alone."""
+    batch: tuple[int, ...] = (32,)
     """Environments at once, for physics."""
     batches: tuple[int, ...] = (1, 16, 64, 256)
     """Frames at once, for the renderers."""
@@ -79,9 +80,9 @@ class BenchOptions:
     growth: GrowthSizes = field(default_factory=GrowthSizes)
 
     def __post_init__(self) -> None:
-        require(1 <= self.batch <= 65536, "--batch", self.batch, "in [1, 65536]")
-        for batch in self.batches:
-            require(1 <= batch <= 65536, "--batches", batch, "in [1, 65536]")
+        for option, batches in (("--batch", self.batch), ("--batches", self.batches)):
+            for batch in batches:
+                require(1 <= batch <= 65536, option, batch, "in [1, 65536]")
         require(1 <= self.repeats <= 1000, "--repeats", self.repeats, "in [1, 1000]")
         CameraConfig(scale=self.scale)
         for num_rocks in self.num_rocks:
@@ -158,19 +159,23 @@ def machine() -> dict[str, Any]:
 
 
 def _physics(asked: BenchOptions):
-    """Both engines, beside a copy in the same run."""
+    """Both engines, beside a copy and MuJoCo's own rollouts in the same run."""
     from segvisrl_jax.env.rover_env import RoverEnv
     from segvisrl_jax.machine.limits import copy_bytes_per_s
-    from segvisrl_jax.machine.speed import physics_row
+    from segvisrl_jax.machine.speed import physics_row, rollout_row
 
     limit = copy_bytes_per_s(asked.repeats)
     yield _copy_row(limit)
     config = preset_config("mlp", asked.preset).env
-    for engine in asked.engines:
-        env = _or_none(functools.partial(RoverEnv, replace_fields(config, engine=engine)))
-        if env is not None:
-            row = {"name": engine, **physics_row(env, asked.batch, asked.repeats)}
-            yield row | _share_of_copy(row, limit)
+    for batch in asked.batch:
+        alone = rollout_row(config, batch, asked.repeats)
+        yield {"name": "mujoco.rollout", **alone}
+        for engine in asked.engines:
+            env = _or_none(functools.partial(RoverEnv, replace_fields(config, engine=engine)))
+            if env is not None:
+                row = {"name": engine, **physics_row(env, batch, asked.repeats)}
+                share = {"percent_of_rollout": 100 * row["decisions_per_s"] / alone["decisions_per_s"]}
+                yield row | _share_of_copy(row, limit) | share
 
 
 def _render(asked: BenchOptions):

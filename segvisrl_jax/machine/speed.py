@@ -13,11 +13,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
+import mujoco.rollout
+import numpy as np
 
 from segvisrl_jax.agent.loss import make_batch
 from segvisrl_jax.agent.networks import make_network
 from segvisrl_jax.config import IMAGE_OBSERVATIONS, EnvConfig, TrainConfig, replace_fields
 from segvisrl_jax.cpu import num_cores
+from segvisrl_jax.env.model import build_physics_model
 from segvisrl_jax.env.rover_env import RoverEnv, observation_shape
 from segvisrl_jax.env.wrappers import BatchEnv
 from segvisrl_jax.machine.limits import flop_of, time_calls
@@ -32,20 +36,35 @@ def physics_row(env: RoverEnv, num_envs: int, repeats: int) -> dict[str, Any]:
     Its bytes are those of the state alone, read and written once in each of MuJoCo's steps: a solver's own numbers
     stay in caches at best.
     """
-    task, physics = env.config.task, env.config.physics
     batch = BatchEnv(env, num_envs)
     state = jax.jit(batch.reset)(jax.random.key(0))
     step, action = jax.jit(batch.step), jnp.full((num_envs, 2), STEADY_ACTION)
     compile_s, seconds = time_calls(functools.partial(step, state, action), repeats)
+    row = _decisions_row(env.config, num_envs, seconds)
+    moved = 2 * _num_bytes(state.rover.physics) / num_envs * row["mujoco_steps_per_s"]
+    return {**row, "gbyte_per_s": moved / 1e9, "compile_s": compile_s}
+
+
+def rollout_row(config: EnvConfig, num_envs: int, repeats: int) -> dict[str, Any]:
+    """The same decisions by ``mujoco.rollout`` alone, on all cores, from rest: no scenes, no judging, no JAX."""
+    model = build_physics_model(config)
+    num_threads = config.physics.num_threads or num_cores()
+    data = [mujoco.MjData(model) for _ in range(num_threads)]
+    start = np.tile(np.concatenate([[0.0], model.qpos0, np.zeros(model.nv)]), (num_envs, 1))
+    control = np.full((num_envs, 1, model.nu), STEADY_ACTION * model.actuator_ctrlrange[0, 1])
+    with mujoco.rollout.Rollout(nthread=num_threads) as pool:
+        roll = functools.partial(pool.rollout, model, data, start, control, nstep=_steps_a_decision(config))
+        return _decisions_row(config, num_envs, time_calls(roll, repeats)[1])
+
+
+def _steps_a_decision(config: EnvConfig) -> int:
+    return round(config.task.decision_dt_s / config.physics.timestep_s)
+
+
+def _decisions_row(config: EnvConfig, num_envs: int, seconds: float) -> dict[str, Any]:
+    """Of a batch's decision that takes so long."""
     rate = num_envs / seconds
-    steps_per_s = rate * round(task.decision_dt_s / physics.timestep_s)
-    return {
-        "batch": num_envs,
-        "decisions_per_s": rate,
-        "mujoco_steps_per_s": steps_per_s,
-        "gbyte_per_s": 2 * _num_bytes(state.rover.physics) / num_envs * steps_per_s / 1e9,
-        "compile_s": compile_s,
-    }
+    return {"batch": num_envs, "decisions_per_s": rate, "mujoco_steps_per_s": rate * _steps_a_decision(config)}
 
 
 def render_row(look: Callable[[Any], Any], config: EnvConfig, num_frames: int, repeats: int) -> dict[str, Any]:

@@ -272,16 +272,18 @@ def test_bench_prints_a_table_and_writes_the_same_numbers(tmp_path):
     done = segvisrl(*words, "--renderers", "scanline", "--repeats", "1", "--json", "b.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "b.json").read_text())
-    copies, measured = ([row for row in result["rows"] if (row["name"] == "copy") is c] for c in (True, False))
-    assert [(row["part"], row["name"], row["batch"]) for row in measured] == [
-        ("physics", "native", 2), ("render", "scanline", 1), ("render", "scanline", 3),
+    assert [(row["part"], row["name"], row.get("batch")) for row in result["rows"]] == [
+        ("physics", "copy", None), ("physics", "mujoco.rollout", 2), ("physics", "native", 2),
+        ("render", "copy", None), ("render", "scanline", 1), ("render", "scanline", 3),
     ]  # fmt: skip
-    assert [row["part"] for row in copies] == ["physics", "render"]
-    for row in measured:
+    _, alone, physics, _, one, three = result["rows"]
+    for row in (physics, one, three):
         assert row.get("frames_per_s", row.get("decisions_per_s")) > 0
         assert 0 < row["percent_of_copy"] < 100
         assert 0.1 < row["memory_gib"] < 16
-    physics, one, _ = measured
+    assert alone["mujoco_steps_per_s"] == 20 * alone["decisions_per_s"] > 0
+    share = 100 * physics["decisions_per_s"] / alone["decisions_per_s"]
+    assert physics["percent_of_rollout"] == pytest.approx(share)
     assert physics["gbyte_per_s"] == pytest.approx(2 * 4 * (11 + 10) * physics["mujoco_steps_per_s"] / 1e9)
     assert one["gbyte_per_s"] == pytest.approx(16 * 9 * 3 * one["frames_per_s"] / 1e9)
     assert done.stdout.count("| scanline | 1920 x 1080 to 16 x 9 | 4 |") == 2
