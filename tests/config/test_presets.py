@@ -56,12 +56,13 @@ def test_validation_rocks_must_fit(rocks, says):
         replace_fields(preset_config("cnn", "cpu"), rocks=rocks)
 
 
-def test_who_turns_before_training():
-    turns = {arch: preset_config(arch, "cpu").network.initial_turn for arch in ARCHS}
+@pytest.mark.parametrize("preset", ["cpu", "gpu"])
+def test_who_turns_before_training(preset):
+    turns = {arch: preset_config(arch, preset).network.initial_turn for arch in ARCHS}
     assert turns.pop("cnn") > 0
     assert turns.pop("cnn_lstm") > 0
     assert set(turns.values()) == {0}
-    headings = {arch: preset_config(arch, "cpu").env.scene.random_start_yaw_share for arch in ARCHS}
+    headings = {arch: preset_config(arch, preset).env.scene.random_start_yaw_share for arch in ARCHS}
     assert headings.pop("cnn_lstm") == 0
     assert set(headings.values()) == {0.5}
 
