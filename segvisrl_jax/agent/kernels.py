@@ -1,8 +1,9 @@
 """A 3 x 3 convolution, a max-pool and their gradients, as machine code of this processor that XLA's programs call.
 
-XLA's own convolutions leave half or more of a CPU idle, inside of loops even more. These keep 6 x 16 sums in registers,
-to which the innermost loop adds 6 numbers of one operand, each times 16 neighbours of the other: near all that a core
-with vectors of 256 bits can do. Written in LLVM's intermediate representation; llvmlite compiles it when first used.
+XLA's own convolutions leave half or more of a CPU idle, inside of loops even more. These keep 24 x 16 sums in registers
+(6 x 16 without AVX-512), to which the innermost loop adds 24 numbers of one operand, each times 16 neighbours of the
+other: near all that a core can do. How many at a time changes no bit of a result: each is summed up in one order.
+Written in LLVM's intermediate representation; llvmlite compiles it when first used.
 
 Images have their channels last. For a convolution a row is padded with a pixel on both sides: what a window shows of a
 row, three pixels, is then one piece of 3 C numbers, which run through the loop. A window's rows follow one another.
@@ -35,8 +36,9 @@ from segvisrl_jax.agent.native_code import (
 CONVOLVE, CORRELATE = "segvisrl_convolve_3x3", "segvisrl_correlate_3x3"
 POOL, UNPOOL = "segvisrl_max_pool_3x3", "segvisrl_max_pool_3x3_gradient"
 OUTPUTS = LANES * VECTORS  # channels of a result at a time, of whose number it must be a divisor
-PIXELS = 6  # of an image at a time, while there are as many
-INPUTS = 6  # of the 3 C at a time, while there are as many; then there are three
+# Of an image, and of the 3 C, so many at a time while there are as many, then so many: measured fastest.
+PIXELS = (24, 12, 6, 2, 1) if LANES == 16 else (6, 2, 1)
+INPUTS = (24, 12, 9, 3) if LANES == 16 else (6, 3)
 WINDOW, PADDING, STRIDE = 3, 2, 2  # the stride is the max-pool's
 
 _lock = threading.Lock()  # programs are made in several threads
@@ -116,10 +118,9 @@ def _convolve(code: Code, images: Value, kernel: Value, bias: Value, floor: Valu
     """Of images (N, H, W, C), kernel (3, 3, C, D), bias (D) and floor () the result (N, H, W, D)."""
     (_, _, width, num_in), (_, _, _, num_out) = code.shape(images), code.shape(result)
     inputs = code.product(WINDOW, num_in)
-    in_blocks = code.multiple(width, PIXELS)
     with _lines(code, images, floor, rows) as line, code.loop(0, num_out, OUTPUTS) as channel:
         biases = code.vectors(code.at(code.data(bias), channel.index))
-        for start, stop, pixels in ((0, in_blocks, PIXELS), (in_blocks, width, 1)):
+        for start, stop, pixels in code.blocks(width, PIXELS):
             with code.loop(start, stop, pixels) as x:
                 with code.loop(line.top, line.bottom, 1, biases * pixels) as window:
                     seen = code.at(line.row(window.index), code.product(x.index, num_in))
@@ -139,14 +140,13 @@ def _correlate(code: Code, images: Value, cotangent: Value, floor: Value, result
     """Of images (N, H, W, C), the result's cotangent (N, H, W, D) and floor () the kernel's gradient (3, 3, C, D)."""
     (_, _, width, num_in), (_, _, _, num_out) = code.shape(images), code.shape(result)
     inputs = code.product(WINDOW, num_in)
-    in_blocks = code.multiple(inputs, INPUTS)
     total = code.data(result)
     code.call("memset", POINTER, total, INT32(0), code.product(WINDOW, inputs, num_out, FLOAT_BYTES))
     with _lines(code, images, floor, rows) as line, code.loop(line.top, line.bottom) as window:
         row = line.row(window.index)
         with code.loop(0, num_out, OUTPUTS) as channel:
             changes = code.at(code.data(cotangent), code.product(line.pixel, num_out), channel.index)
-            for start, stop, taps in ((0, in_blocks, INPUTS), (in_blocks, inputs, WINDOW)):
+            for start, stop, taps in code.blocks(inputs, INPUTS):
                 with code.loop(start, stop, taps) as tap:
                     first = code.product(code.sum(code.product(window.index, inputs), tap.index), num_out)
                     places = [code.at(total, first, code.product(k, num_out), channel.index) for k in range(taps)]

@@ -15,7 +15,9 @@ from llvmlite import binding, ir
 
 from segvisrl_jax import ffi
 
-LANES, VECTORS = 8, 2  # numbers of a vector; vectors side by side
+# Numbers of a vector, as many as this processor multiplies at once (AVX-512, or 256 bits); vectors side by side.
+LANES = 16 if binding.get_host_cpu_features().get("avx512f") else 8
+VECTORS = 16 // LANES
 FLOAT_BYTES = 4
 FLOAT, INT, INT32, BYTE, POINTER = ir.FloatType(), ir.IntType(64), ir.IntType(32), ir.IntType(8), ir.PointerType()
 VECTOR = ir.VectorType(FLOAT, LANES)
@@ -109,9 +111,14 @@ class Code:
         builder.position_at_end(after)
         loop.values = current[1:]
 
-    def multiple(self, number: Value, of: int) -> Value:
-        """The largest one of a whole number that is not above another one."""
-        return self.product(self.builder.sdiv(number, whole(of)), of)
+    def blocks(self, total: Value, sizes: Sequence[int]) -> Iterator[tuple[Value, Value, int]]:
+        """From where to where ``range(total)`` is taken so many at a time: the first size while it fits, then the next."""
+        start = whole(0)
+        for size in sizes:
+            count = self.builder.sdiv(self.sum(total, self.product(start, -1)), whole(size))
+            stop = self.sum(start, self.product(count, size))
+            yield start, stop, size
+            start = stop
 
     def smaller(self, one: Value, other: Value) -> Value:
         """Of two whole numbers."""

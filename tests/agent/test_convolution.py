@@ -17,7 +17,7 @@ from segvisrl_jax.agent.convolution import convolution, max_pool, plain_convolut
 from segvisrl_jax.agent.networks import make_network
 from segvisrl_jax.config import NetworkConfig
 
-SIZES = {"blocks of pixels": (6, 12), "a rest": (7, 20), "narrower than a block": (4, 5), "one pixel": (1, 1)}
+SIZES = {"blocks of pixels": (6, 12), "all blocks": (3, 45), "a rest": (7, 20), "narrow": (4, 5), "one pixel": (1, 1)}
 CHANNELS = {"image": (3, 16), "narrow": (16, 16), "wide": (32, 32), "odd numbers": (5, 7), "one": (1, 1)}
 
 
@@ -154,3 +154,36 @@ def test_another_process_takes_the_compiled_program_from_the_disk(tmp_path):
     said.append(subprocess.run(run, capture_output=True, text=True, check=True, env=environment).stdout)
     assert said[0] == said[1]
     assert {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*convolution*-cache")} == kept
+
+
+def test_vectors_of_any_width_give_the_same_bits():
+    narrow = """
+import llvmlite.binding as binding
+
+found = binding.get_host_cpu_features()
+found["avx512f"] = False
+binding.get_host_cpu_features = lambda: found
+"""
+    work = """
+import hashlib
+import jax
+import jax.numpy as jnp
+import numpy as np
+from segvisrl_jax.agent import native_code
+from segvisrl_jax.agent.convolution import convolution, max_pool
+
+def total(images, kernel, bias):
+    return jnp.sum(jnp.square(max_pool(convolution(convolution(images, kernel, bias, True), kernel, bias, False))))
+
+draw = np.random.default_rng(0)
+arrays = [jnp.asarray(draw.normal(size=shape), jnp.float32) for shape in ((2, 9, 45, 32), (3, 3, 32, 32), (32,))]
+gradients = jax.jit(jax.grad(total, argnums=(0, 1, 2)))(*arrays)
+digest = hashlib.sha256(b"".join(np.asarray(gradient).tobytes() for gradient in gradients)).hexdigest()
+print(native_code.LANES, digest)
+"""
+    said = [
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+        for code in (narrow + work, work)
+    ]
+    assert said[0][0] == "8"
+    assert said[0][1] == said[1][1]
