@@ -112,7 +112,7 @@ class Code:
         loop.values = current[1:]
 
     def blocks(self, total: Value, sizes: Sequence[int]) -> Iterator[tuple[Value, Value, int]]:
-        """From where to where ``range(total)`` is taken so many at a time: the first size while it fits, then the next."""
+        """(start, stop, size): ``range(total)`` in steps of the first size while it fits, then of the next."""
         start = whole(0)
         for size in sizes:
             count = self.builder.sdiv(self.sum(total, self.product(start, -1)), whole(size))
