@@ -185,7 +185,8 @@ def _render(asked: BenchOptions):
 
     limit = copy_bytes_per_s(asked.repeats)
     yield _copy_row(limit)
-    base = replace_fields(preset_config("cnn_lstm", asked.preset).env, scale=asked.scale)
+    preset = preset_config("cnn_lstm", asked.preset).env
+    base = replace_fields(preset, scale=asked.scale, random_num_rocks_max=0)  # as many rocks as are asked for
     for num_rocks in asked.num_rocks:
         config = replace_fields(base, num_rocks=num_rocks)
         looks = {name: _look_or_none(name, config) for name in asked.renderers}

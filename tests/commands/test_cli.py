@@ -291,6 +291,19 @@ def test_bench_prints_a_table_and_writes_the_same_numbers(tmp_path):
     assert result["machine"]["cores"] == num_cores()
 
 
+def test_bench_draws_as_many_rocks_as_are_asked_for(monkeypatch, capsys):
+    seen = []
+
+    def render_row(look, config, num_frames, repeats):
+        seen.append(config.scene.most_rocks)
+        return {"rocks": config.scene.num_rocks, "batch": num_frames, "frames_per_s": 1.0, "gbyte_per_s": 1.0}
+
+    monkeypatch.setattr("segvisrl_jax.machine.speed.render_row", render_row)
+    words = ["render", "--renderers", "scanline", "--num-rocks", "0", "3", "--batches", "1", "--repeats", "1"]
+    assert main(["bench", *words]) == 0
+    assert seen == [0, 3]
+
+
 @pytest.mark.slow
 def test_bench_says_how_costs_grow(tmp_path):
     sizes = ["--growth.rocks", "1", "--growth.envs", "2", "--growth.scales", "2", "--growth.unrolls", "32"]
