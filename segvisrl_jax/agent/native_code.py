@@ -15,8 +15,17 @@ from llvmlite import binding, ir
 
 from segvisrl_jax import ffi
 
+
+def _host_features() -> binding.FeatureMap:
+    """What this processor can do; nothing where LLVM cannot tell."""
+    try:
+        return binding.get_host_cpu_features()
+    except RuntimeError:
+        return binding.FeatureMap()
+
+
 # Numbers of a vector, as many as this processor multiplies at once (AVX-512, or 256 bits); vectors side by side.
-LANES = 16 if binding.get_host_cpu_features().get("avx512f") else 8
+LANES = 16 if _host_features().get("avx512f") else 8
 VECTORS = 16 // LANES
 FLOAT_BYTES = 4
 FLOAT, INT, INT32, BYTE, POINTER = ir.FloatType(), ir.IntType(64), ir.IntType(32), ir.IntType(8), ir.PointerType()
@@ -41,7 +50,7 @@ def compile_and_register(functions: dict[str, tuple[Write, int, int]]) -> None:
         _define_handler(module, target, write, num_arguments, num_results)
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
-    processor, features = binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
+    processor, features = binding.get_host_cpu_name(), _host_features().flatten()
     machine = binding.Target.from_default_triple().create_target_machine(processor, features, opt=3)
     code = binding.parse_assembly(str(module))
     passes = binding.create_pass_builder(machine, binding.PipelineTuningOptions(speed_level=3))
