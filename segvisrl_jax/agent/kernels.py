@@ -36,7 +36,7 @@ from segvisrl_jax.agent.native_code import (
 CONVOLVE, CORRELATE = "segvisrl_convolve_3x3", "segvisrl_correlate_3x3"
 POOL, UNPOOL = "segvisrl_max_pool_3x3", "segvisrl_max_pool_3x3_gradient"
 OUTPUTS = LANES * VECTORS  # channels of a result at a time, of whose number it must be a divisor
-# Of an image, and of the 3 C, so many at a time while there are as many, then so many: measured fastest.
+# Of an image, and of the 3 C, so many at a time while there are as many, then so many: measured fastest (Zen 5).
 PIXELS = (24, 12, 6, 2, 1) if LANES == 16 else (6, 2, 1)
 INPUTS = (24, 12, 9, 3) if LANES == 16 else (6, 3)
 WINDOW, PADDING, STRIDE = 3, 2, 2  # the stride is the max-pool's

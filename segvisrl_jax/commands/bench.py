@@ -167,11 +167,13 @@ def _physics(asked: BenchOptions):
     limit = copy_bytes_per_s(asked.repeats)
     yield _copy_row(limit)
     config = preset_config("mlp", asked.preset).env
+    envs = {
+        engine: _or_none(functools.partial(RoverEnv, replace_fields(config, engine=engine))) for engine in asked.engines
+    }
     for batch in asked.batch:
         alone = rollout_row(config, batch, asked.repeats)
         yield {"name": "mujoco.rollout", **alone}
-        for engine in asked.engines:
-            env = _or_none(functools.partial(RoverEnv, replace_fields(config, engine=engine)))
+        for engine, env in envs.items():
             if env is not None:
                 row = {"name": engine, **physics_row(env, batch, asked.repeats)}
                 share = {"percent_of_rollout": 100 * row["decisions_per_s"] / alone["decisions_per_s"]}

@@ -22,6 +22,7 @@ from segvisrl_jax.agent.networks import make_network
 from segvisrl_jax.config import IMAGE_OBSERVATIONS, EnvConfig, TrainConfig, replace_fields
 from segvisrl_jax.cpu import num_cores
 from segvisrl_jax.env.model import build_physics_model
+from segvisrl_jax.env.physics.engine import steps_per_judgement
 from segvisrl_jax.env.rover_env import RoverEnv, observation_shape
 from segvisrl_jax.env.wrappers import BatchEnv
 from segvisrl_jax.machine.limits import flop_of, time_calls
@@ -58,7 +59,7 @@ def rollout_row(config: EnvConfig, num_envs: int, repeats: int) -> dict[str, Any
 
 
 def _steps_a_decision(config: EnvConfig) -> int:
-    return round(config.task.decision_dt_s / config.physics.timestep_s)
+    return steps_per_judgement(config) * config.task.num_judgements
 
 
 def _decisions_row(config: EnvConfig, num_envs: int, seconds: float) -> dict[str, Any]:

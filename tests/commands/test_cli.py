@@ -280,6 +280,7 @@ def test_bench_prints_a_table_and_writes_the_same_numbers(tmp_path):
     for row in (physics, one, three):
         assert row.get("frames_per_s", row.get("decisions_per_s")) > 0
         assert 0 < row["percent_of_copy"] < 100
+    for row in (alone, physics, one, three):
         assert 0.1 < row["memory_gib"] < 16
     assert alone["mujoco_steps_per_s"] == 20 * alone["decisions_per_s"] > 0
     share = 100 * physics["decisions_per_s"] / alone["decisions_per_s"]
