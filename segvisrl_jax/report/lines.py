@@ -21,6 +21,7 @@ SPARE_COLOURS = ("#e69f00", "#cc79a7", "#56b4e9", "#009e73", "#d55e00", "#0072b2
 """For a second method of a kind; the last ones are also those of goals and collisions on maps."""
 BAND_ALPHA = 0.13
 NAME_SIZE_PT, NAME_SPACING = 10.5, 1.3  # of the names at the lines' ends, and lines of text between two of them
+NAME_WIDTH = 24  # characters; a longer name is broken
 POINTS_PER_INCH = 72
 
 
@@ -50,6 +51,8 @@ def method_colours(methods: Sequence[str]) -> list[str]:
 def name_ends(axes: Axes, ends: Sequence[LineEnd]) -> None:
     """Writes each line's name to the right of the axes at the height where the line ends, moved apart where they touch.
 
+    Long names are broken into several lines of text.
+
     Call it last: heights are measured in the figure as it is laid out then.
     """
     if not ends:
@@ -60,10 +63,13 @@ def name_ends(axes: Axes, ends: Sequence[LineEnd]) -> None:
     to_axes = axes.transAxes.inverted()
     heights = np.array([to_axes.transform(axes.transData.transform((end.x, end.y)))[1] for end in ends])
     axes_inches = axes.get_window_extent().height / figure.dpi
-    places = spread(heights, NAME_SPACING * NAME_SIZE_PT / POINTS_PER_INCH / axes_inches)
-    for end, place in zip(ends, places, strict=True):
+    names = [_broken(end.name) for end in ends]
+    sizes = (
+        np.array([name.count("\n") + 1 for name in names]) * NAME_SPACING * NAME_SIZE_PT / POINTS_PER_INCH / axes_inches
+    )
+    for end, name, place in zip(ends, names, spread(heights, sizes), strict=True):
         axes.annotate(
-            end.name,
+            name,
             xy=(end.x, end.y),
             xycoords="data",
             xytext=(1.04, place),
@@ -77,26 +83,36 @@ def name_ends(axes: Axes, ends: Sequence[LineEnd]) -> None:
         )
 
 
-def spread(places: Float[np.ndarray, "K"], apart: float) -> Float[np.ndarray, "K"]:
-    """The places in their order, moved as little as need be to lie ``apart``: neighbours that touch share the way.
+def _broken(name: str) -> str:
+    """A long name in several lines of text, broken at its brackets and commas."""
+    return name if len(name) <= NAME_WIDTH else name.replace(" (", "\n(").replace(", ", ",\n")
 
-    Those that touch are joined to a stack about the mean of where they wanted to be, until no stacks touch.
+
+def spread(places: Float[np.ndarray, "K"], sizes: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
+    """The places in their order, moved as little as need be to fit their sizes: neighbours that touch share the way.
+
+    Those that touch are joined to a stack, where the squares of their ways add up to the least, until no stacks touch.
     """
     order = np.argsort(places, kind="stable")
-    stacks: list[list[float]] = []  # each: where its members wanted to be, ascending
-    for place in places[order]:
-        stacks.append([float(place)])
-        while len(stacks) > 1 and _bottom(stacks[-1], apart) < _top(stacks[-2], apart) + apart:
+    stacks: list[list[int]] = []  # from below
+    for index in order:
+        stacks.append([int(index)])
+        while len(stacks) > 1 and _bottom(stacks[-1], places, sizes) < _top(stacks[-2], places, sizes):
             stacks[-2:] = [stacks[-2] + stacks[-1]]
-    moved = [_bottom(stack, apart) + apart * rank for stack in stacks for rank in range(len(stack))]
     result = np.empty(len(places))
-    result[order] = moved
+    for stack in stacks:
+        result[stack] = _bottom(stack, places, sizes) + _offsets(stack, sizes)
     return result
 
 
-def _bottom(stack: list[float], apart: float) -> float:
-    return sum(stack) / len(stack) - apart * (len(stack) - 1) / 2
+def _offsets(stack: list[int], sizes: Float[np.ndarray, "K"]) -> Float[np.ndarray, "M"]:
+    """From the stack's bottom to the middle of each member."""
+    return np.cumsum(sizes[stack]) - sizes[stack] / 2
 
 
-def _top(stack: list[float], apart: float) -> float:
-    return _bottom(stack, apart) + apart * (len(stack) - 1)
+def _bottom(stack: list[int], places: Float[np.ndarray, "K"], sizes: Float[np.ndarray, "K"]) -> float:
+    return float(np.mean(places[stack] - _offsets(stack, sizes)))
+
+
+def _top(stack: list[int], places: Float[np.ndarray, "K"], sizes: Float[np.ndarray, "K"]) -> float:
+    return _bottom(stack, places, sizes) + float(np.sum(sizes[stack]))

@@ -5,6 +5,7 @@ Reads no files: the evaluations come checked (``commands/table.py``).
 
 import dataclasses
 import difflib
+import itertools
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,7 +35,7 @@ OF_THE_WORLD = ("scene.", "task.", "physics.", "conditions.")
 NOT_OF_THE_WORLD = ("physics.engine", "physics.num_threads", "physics.timestep_s")
 """Settings of those parts that a method may have of its own, as it may have its rewards and its camera."""
 MOST_TICKS = 12
-MOST_DISTINCTIONS = 2  # settings in the name of a line
+MOST_DISTINCTIONS = 3  # settings in the name of a line
 SIDE_SHARE = 0.04  # of an axis, free on both sides of the values
 ASIDE_PT = 4.0  # between methods, so that points at the same place are all seen
 
@@ -105,17 +106,20 @@ def lines_of(evaluations: Sequence[Evaluation], field: str) -> list[Line]:
 
 
 def _distinction(group: Sequence[Evaluation], firsts: Sequence[Evaluation], field: str) -> str:
-    """What tells a line from others of its method: its run; of several runs, the settings of their training if few."""
-    recipes = [first.recipe for first in firsts if first.method == group[0].method]
-    if len(recipes) == 1:
+    """What tells a line from others of its method: its run; of several runs, the fewest settings of their training."""
+    others = [first.recipe for first in firsts if first.method == group[0].method and first is not group[0]]
+    if not others:
         return ""
-    ours = group[0].recipe
-    differing = [name for name, value in ours.items() if any(other.get(name) != value for other in recipes)]
-    differing = [name for name in differing if name != f"env.{field}"]
     sources = list(dict.fromkeys(map(_source, group)))
-    if len(sources) == 1 or not 1 <= len(differing) <= MOST_DISTINCTIONS:
-        return ", ".join(sources)
-    return ", ".join(f"{name.rpartition('.')[2]} {ours[name]}" for name in differing)
+    if len(sources) == 1:
+        return sources[0]
+    ours = {name: value for name, value in group[0].recipe.items() if name != f"env.{field}"}
+    differing = [name for name, value in ours.items() if any(other.get(name) != value for other in others)]
+    for count in range(1, MOST_DISTINCTIONS + 1):
+        for names in itertools.combinations(differing, count):
+            if all(any(other.get(name) != ours[name] for name in names) for other in others):
+                return ", ".join(f"{name.rpartition('.')[2]} {ours[name]}" for name in names)
+    return ", ".join(sources)
 
 
 def _require_same_world(first: Evaluation, other: Evaluation, field: str) -> None:
@@ -213,7 +217,9 @@ def _draw_line(axes: Axes, line: Line, kind: str, colour: str, values: Sequence[
     shares = np.array([evaluation.numbers[kind] for evaluation in drawn])
     low, high = np.array([evaluation.numbers[f"{kind}_ci95"] for evaluation in drawn]).T
     is_ceiling = line.method == CEILING
-    if not is_ceiling:
+    if len(places) == 1:
+        axes.vlines(places, low, high, color=colour, alpha=2 * BAND_ALPHA, lw=3, transform=place)
+    elif not is_ceiling:
         axes.fill_between(places, low, high, color=colour, alpha=BAND_ALPHA, lw=0, transform=place)
     (drawn_line,) = axes.plot(places, shares, "-o", color=colour, lw=1.8, ms=4.5, mec="white", mew=0.6, zorder=3)
     drawn_line.set(

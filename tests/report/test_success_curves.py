@@ -100,6 +100,26 @@ def test_other_policies_are_other_lines_named_by_where_they_came_from():
     assert names == ["cnn (lstm_size 256)", "cnn (lstm_size 7)", "P controller"]
 
 
+def test_lines_of_several_runs_are_named_by_the_fewest_settings_that_tell_them_apart():
+    runs = []
+    for i, (lstm_size, channels, discount) in enumerate([(256, 16, 0.97), (256, 32, 0.5), (7, 32, 0.97)]):
+        for n in (4, 8):
+            one = trained(40, num_rocks=n, source=f"runs/{i}-{n}")
+            one.training_config["network"] |= {"lstm_size": lstm_size, "channels": [channels, 32, 32]}
+            one.training_config["ppo"]["discount"] = discount
+            runs.append(one)
+    names = [line.name for line in lines_of(runs, "scene.num_rocks")]
+    assert names == ["cnn (channels [16, 32, 32])", "cnn (discount 0.5)", "cnn (lstm_size 7)"]
+    for one in runs[2:]:
+        one.training_config["network"]["lstm_size"] = 256
+        one.training_config["ppo"]["discount"] = 0.5
+    for one in runs[4:]:
+        one.training_config["ppo"]["unroll_length"] = 3
+    runs[0].training_config["ppo"]["discount"] = runs[1].training_config["ppo"]["discount"] = 0.5
+    names = [line.name for line in lines_of(runs, "scene.num_rocks")]
+    assert names[1:] == ["cnn (channels [32, 32, 32], unroll_length 32)", "cnn (unroll_length 3)"]
+
+
 def test_other_worlds_are_refused_but_other_eyes_engines_and_rewards_are_not():
     lines = lines_of([*density(), *(trained(40, num_rocks=n, scale=40.0) for n in (0, 4))], "scene.num_rocks")
     assert len(lines) == 2
