@@ -10,7 +10,6 @@ from types import ModuleType
 
 import jax
 import jax.numpy as jnp
-from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float32
 
 kernels: ModuleType | None
@@ -19,7 +18,6 @@ try:
 except ImportError:
     kernels = None
 
-CONVOLVED = "convolved"  # name of what a gradient must keep where it keeps little (``jax.checkpoint``)
 LAYOUT = ("NHWC", "HWIO", "NHWC")  # as flax.linen.Conv
 WINDOW = (3, 3)  # Impala's (Espeholt et al., 2018)
 POOL_WINDOW, POOL_STRIDE = 3, 2  # Impala's max-pool
@@ -33,7 +31,7 @@ Pooled = Float32[Array, "N H2 W2 C"]
 
 def convolution(images: Images, kernel: Kernel, bias: Bias, rectify: bool) -> Result:
     """3 x 3 convolution, stride 1, SAME padding, of the images or, where ``rectify``, of what relu leaves of them."""
-    return checkpoint_name(_convolution(images, kernel, bias, rectify), CONVOLVED)
+    return _convolution(images, kernel, bias, rectify)
 
 
 def plain_convolution(images: Images, kernel: Kernel, bias: Bias, rectify: bool) -> Result:

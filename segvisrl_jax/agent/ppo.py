@@ -23,7 +23,7 @@ from flax import struct
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float32, Int32
 
-from segvisrl_jax.agent.convolution import CONVOLVED, largest_divisor
+from segvisrl_jax.agent.convolution import largest_divisor
 from segvisrl_jax.agent.loss import (
     Batch,
     Draw,
@@ -202,9 +202,7 @@ class Learner:
     @functools.partial(jax.jit, static_argnums=0)
     def _look_at(self, params: Params, piece: Any) -> tuple[Float32[Array, "n 1 M"], Pullback]:
         observation = piece if self.draw is None else self.draw(piece)
-        keep = jax.checkpoint_policies.save_only_these_names(CONVOLVED)
-        maps = jax.checkpoint(lambda params: self.network.maps(params, observation), policy=keep, prevent_cse=False)
-        return jax.vjp(maps, params)
+        return jax.vjp(lambda params: self.network.maps(params, observation), params)
 
     @functools.partial(jax.jit, static_argnums=0)
     def loss_gradient(

@@ -19,7 +19,7 @@ from segvisrl_jax.machine.resources import all_memory_bytes, free_memory_bytes, 
 PROGRAMS_BYTES = 0.75 * GIB  # compiling and the compiled programs, beside libraries
 LEARNING_SHARE = 1.2  # what is kept for the gradient, with what the cores work on
 ACTING_SHARE = 0.65  # what looking at images takes at once
-# On an accelerator, or on several devices, autodiff keeps more than that: 500 bytes a pixel over 208 (agent/ppo.py).
+# On an accelerator, or on several devices, max-pools and relu keep more than the kernels do (agent/convolution.py).
 PLAIN_LEARNING_SHARE = 2.4
 SIGNS = ("resource_exhausted", "out of memory")  # in the text of XLA's error, in small letters
 
@@ -28,7 +28,8 @@ def keep_freed_memory() -> None:
     """Tells glibc to keep freed memory for the next allocation, where there is glibc.
 
     XLA on a CPU allocates its buffers anew in every call. Those above 32 MiB come fresh from the kernel each time, page
-    by page, which costs a quarter of the gradient's time. See mallopt(3).
+    by page, which costs a quarter of the gradient's time. One arena for all threads, since others take what is
+    above 64 MiB fresh from the kernel whatever they are told. See mallopt(3).
     """
     with contextlib.suppress(OSError, AttributeError):
         mallopt = ctypes.CDLL("libc.so.6").mallopt

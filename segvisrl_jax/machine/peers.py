@@ -26,7 +26,6 @@ from segvisrl_jax.machine.speed import learning_row, look_flop, training_flop
 from segvisrl_jax.training.loop import Trainer
 
 SCALES = (10.0, 40.0)  # the paper's 192 x 108, and the 48 x 27 of the preset for a CPU
-FEW_ENVS, FEW_MINIBATCHES = 8, 2  # for the gradient alone: the minibatch is that of the preset, 4 environments
 Pass = tuple[Callable[[], None], int]  # something to time, and the images that go through it
 NUM_UPDATES = 3  # of recurrent PPO; the first warms up
 
@@ -47,8 +46,7 @@ def peer_rows(preset: TrainConfig, repeats: int, scales: Sequence[float] = SCALE
     yield {"name": "matrix product", "gflop_per_s": limit / 1e9}
     torch.set_num_threads(num_cores())
     for scale in scales:
-        few = {"num_envs": FEW_ENVS, "num_minibatches": FEW_MINIBATCHES, "num_epochs": 1}
-        config = replace_fields(preset, scale=scale, kl_stop=0.0, **few)
+        config = replace_fields(preset, scale=scale, kl_stop=0.0, num_epochs=1)
         ours, theirs = _in_turn([_our_gradient(config), _torch_gradient(config)], repeats)
         rows, columns = config.env.camera.observation_size_px
         share = 3 * look_flop(config) / limit

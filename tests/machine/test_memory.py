@@ -1,6 +1,7 @@
 """What a training takes is counted, and where memory ends the user gets one line that says what to do."""
 
 import importlib
+import platform
 import resource
 import subprocess
 import sys
@@ -128,3 +129,37 @@ def test_a_training_that_really_runs_out_of_memory(tmp_path):
     for part in ("observations 23.2 GiB", "activations", f"this machine has {LIMIT_GIB:.1f} GiB", *ADVICE):
         assert part in line
     assert "Traceback" not in done.stdout
+
+
+ALLOCATES_TWICE = """
+import resource, threading
+from segvisrl_jax.machine.memory import keep_freed_memory
+
+def allocate():
+    b"x" * (100 * 2**20)
+
+def run():
+    thread = threading.Thread(target=allocate)
+    thread.start()
+    thread.join()
+
+def faults():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+
+{first}
+run()
+before = faults()
+run()
+print(faults() - before)
+"""
+
+
+@pytest.mark.skipif("glibc" not in platform.libc_ver(), reason="another C library keeps memory as it likes")
+def test_freed_memory_is_not_asked_of_the_kernel_again():
+    faults = {}
+    for first in ("", "keep_freed_memory()"):
+        words = [sys.executable, "-c", ALLOCATES_TWICE.format(first=first)]
+        faults[first] = int(subprocess.run(words, check=True, capture_output=True, text=True).stdout)
+    pages = 100 * 2**20 // resource.getpagesize()
+    assert faults[""] > pages / 2
+    assert faults["keep_freed_memory()"] < pages / 100
