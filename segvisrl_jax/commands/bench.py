@@ -1,12 +1,13 @@
 """``segvisrl bench``: how fast physics, rendering and learning run on this machine."""
 
+import contextlib
 import functools
 import json
 import os
 import platform
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -36,6 +37,7 @@ from segvisrl_jax.machine.memory import peak_bytes
 
 Part = Literal["physics", "render", "policy", "update", "train", "profile", "start", "peers", "growth"]
 FEW = {"num_envs": 8, "num_minibatches": 2}  # on a CPU, for the update: minibatches as large as the preset's
+WIPE_LINE = "\x1b[K"  # from the cursor on, in a terminal
 ELSEWHERE = ("start", "growth")  # measured in processes of their own
 PlainRenderer = Literal["scanline", "gl", "warp", "mujoco.Renderer"]
 """The project's renderers, and MuJoCo's Python class as one would use it without this project."""
@@ -127,9 +129,10 @@ def run(options: Sequence[str]) -> int:
 
     for part in asked.parts:
         measured = []
-        for row in measure[part](asked):
-            measured.append(row if part in ELSEWHERE else {**row, "memory_gib": peak_bytes() / GIB})
-            print(f"{part}: rows measured: {len(measured)}", end="\r", file=sys.stderr, flush=True)
+        with _telling(part) as tell:
+            for row in measure[part](asked):
+                measured.append(row if part in ELSEWHERE else {**row, "memory_gib": peak_bytes() / GIB})
+                tell(len(measured))
         rows += [{"part": part, **row} for row in measured]
         try:
             keep()
@@ -139,6 +142,21 @@ def run(options: Sequence[str]) -> int:
             rows += _conclude_growth(asked, measured)
             keep()
     return 0
+
+
+@contextlib.contextmanager
+def _telling(part: str) -> Iterator[Callable[[int], None]]:
+    """Says how many rows have been measured: on a terminal in one line, which is wiped out in the end."""
+    is_terminal = sys.stderr.isatty()
+
+    def tell(count: int) -> None:
+        print(f"{part}: rows measured: {count}", end="\r" if is_terminal else "\n", file=sys.stderr, flush=True)
+
+    try:
+        yield tell
+    finally:
+        if is_terminal:
+            print(WIPE_LINE, end="", file=sys.stderr, flush=True)
 
 
 def machine() -> dict[str, Any]:
