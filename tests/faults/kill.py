@@ -53,7 +53,7 @@ def stage(run: Path, said: str) -> str:
     """What a run was about, from what it left: good enough to see that kills fall everywhere."""
     if not (run / "config.json").exists():
         return "start"
-    if "test scenes" in said or (run / "eval.json").exists():
+    if ": test scenes " in said or (run / "eval.json").exists():
         return "drawing"
     if list(run.glob("checkpoints/*tmp*")) or list(run.glob("**/*.partial")):
         return "writing"
@@ -68,13 +68,14 @@ def end_somehow(runs: Path, name: str, arch: str, seconds: float, chance: random
     while True:
         lives_s = chance.uniform(0.0, seconds) if len(ending.killed_in) < chance.randint(1, 2 * KILLS) else LONGEST_S
         with log.open("a") as said:
+            begins = said.tell()
             process = subprocess.Popen(command(runs, name, arch), stdout=said, stderr=said, env=environment)
             try:
                 code = process.wait(lives_s)
             except subprocess.TimeoutExpired:
                 process.send_signal(signal.SIGKILL)
                 process.wait()
-                ending.killed_in.append(stage(runs / name, log.read_text()))
+                ending.killed_in.append(stage(runs / name, log.read_text()[begins:]))
                 continue
         if code != 0:
             raise RuntimeError(f"{name} ended with exit code {code}:\n{log.read_text()[-3000:]}")
