@@ -36,7 +36,6 @@ from segvisrl_jax.machine.growth import GrowthSizes
 from segvisrl_jax.machine.memory import peak_bytes
 
 Part = Literal["physics", "render", "policy", "update", "train", "profile", "start", "peers", "growth"]
-FEW = {"num_envs": 8, "num_minibatches": 2}  # on a CPU, for the update: minibatches as large as the preset's
 WIPE_LINE = "\x1b[K"  # from the cursor on, in a terminal
 ELSEWHERE = ("start", "growth")  # measured in processes of their own
 PlainRenderer = Literal["scanline", "gl", "warp", "mujoco.Renderer"]
@@ -48,13 +47,13 @@ class BenchOptions:
     """Times parts of the pipeline: medians of repeats, compilation apart. Prints tables; JSON where asked."""
 
     parts: tyro.conf.Positional[tuple[Part, ...]] = ("physics", "render", "train")
-    """physics, render, train; these three where none is named. policy, update: the network's decisions and learning.
-    profile: where an update's time goes, by its parts and by the operations that take longest. start: what comes before
-    a training's first update. peers: PyTorch and sb3-contrib beside this project (needs the extra [sb3]). growth: time
-    and memory against rocks, environments, image and unroll, one of them varied at a time; 20 to 25 minutes. Rows have
-    the most memory that the process had until then, and the share of a limit that was measured beside them: of a large
-    copy (physics, render) or of a large matrix product (policy, update, train, peers); for physics also of what
-    mujoco.rollout, on all cores of the CPU, does alone."""
+    """physics, render, train; these three where none is named. policy, update: the network's decisions and an epoch of
+    its learning. profile: where an update's time goes, by its parts and by the operations that take longest. start:
+    what comes before a training's first update. peers: PyTorch and sb3-contrib beside this project (needs the extra
+    [sb3]). growth: time and memory against rocks, environments, image and unroll, one of them varied at a time; 20 to
+    25 minutes. Rows have the most memory that the process had until then, and the share of a limit that was measured
+    beside them: of a large copy (physics, render) or of a large matrix product (policy, update, train, peers); for
+    physics also of what mujoco.rollout, on all cores of the CPU, does alone."""
     batch: tuple[int, ...] = (32,)
     """Environments at once, for physics."""
     batches: tuple[int, ...] = (1, 16, 64, 256)
@@ -254,17 +253,13 @@ def _policy(asked: BenchOptions):
 
 
 def _update(asked: BenchOptions):
-    """Learning alone and its parts, beside a matrix product in the same run."""
-    import jax
-
+    """Learning alone, one epoch of the preset's update, and its parts, beside a matrix product in the same run."""
     from segvisrl_jax.machine.limits import matrix_flop_per_s
     from segvisrl_jax.machine.speed import update_rows
 
     limit = matrix_flop_per_s(asked.repeats)
     yield {"name": "matrix product", "gflop_per_s": limit / 1e9}
     config = replace_fields(preset_config(asked.arch, asked.preset), num_epochs=1, scale=asked.scale)
-    if jax.default_backend() == "cpu":
-        config = replace_fields(config, **FEW)
     yield from update_rows(config, asked.repeats, limit)
 
 

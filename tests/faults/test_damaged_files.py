@@ -1,6 +1,6 @@
 """Every file of a checkpoint, a run and a policy, damaged in every way: named, or made up for by what is whole.
 
-Each test goes through all cases of its kind. ``NUM_FLIPS=3 pytest -s tests/faults/test_damaged_files.py`` tries more
+Each test goes through all cases of its kind. ``NUM_FLIPS=10 pytest -s tests/faults/test_damaged_files.py`` tries more
 bits of each file, and prints how many cases there were.
 """
 
