@@ -31,7 +31,7 @@ PIXEL_MAX = 255.0
 # Gains of the orthogonal initialisers: those usual for PPO. Inside residual blocks sqrt(2) would
 # multiply the features tenfold (root mean square 21 against 1.9) and saturate the LSTM's gates.
 HIDDEN_GAIN, RESIDUAL_GAIN, POLICY_GAIN, VALUE_GAIN = math.sqrt(2.0), 0.7, 0.01, 1.0
-MIN_STD, MAX_STD = 0.01, 10.0  # of the action; beyond, log-probabilities explode or all is clipped
+MAX_STD = 10.0  # of the action; beyond, all is clipped
 
 
 @struct.dataclass
@@ -212,7 +212,7 @@ class ActorCritic(nn.Module):
         free_mean = self.policy_head(features)
         deviation = mean_reach(self.config) * jnp.tanh(free_mean) if self.config.bounded_mean else free_mean
         mean = MIDDLE_SPEED + deviation
-        log_std = jnp.clip(self.log_std, math.log(MIN_STD), math.log(MAX_STD))
+        log_std = jnp.clip(self.log_std, math.log(self.config.min_std), math.log(MAX_STD))
         return PolicyOutput(mean, log_std, self.value_head(features)[..., 0])
 
 

@@ -31,6 +31,8 @@ class NetworkConfig:
     """How far beyond that range the squashed mean may go, so that it is not saturated at full speed and none."""
     initial_std: float = 0.25
     """Standard deviation of the action at the start, as a share of the top speed."""
+    min_std: float = 0.01
+    """What the standard deviation does not fall below (at 0, log-probabilities would explode)."""
     initial_turn: float = 0.0
     """By how much the right wheel is faster than the left at the start, as a share of the top speed: above 0, a policy
     turns left until it learns otherwise."""
@@ -45,6 +47,7 @@ class NetworkConfig:
         require(1 <= self.feature_size <= 8192, f"{p}.feature_size", self.feature_size, "in [1, 8192]")
         require(1 <= self.lstm_size <= 8192, f"{p}.lstm_size", self.lstm_size, "in [1, 8192]")
         require(0 < self.initial_std <= 10, f"{p}.initial_std", self.initial_std, "in (0, 10]")
+        require(0.001 <= self.min_std <= self.initial_std, f"{p}.min_std", self.min_std, "in [0.001, initial_std]")
         require(0 <= self.mean_overshoot <= 1, f"{p}.mean_overshoot", self.mean_overshoot, "in [0, 1]")
         require(-1 < self.initial_turn < 1, f"{p}.initial_turn", self.initial_turn, "in (-1, 1)")
 

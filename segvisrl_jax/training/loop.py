@@ -235,8 +235,8 @@ def _trainer_that_can_see(config: TrainConfig) -> Trainer:
     return trainer
 
 
-# Settings of random weights only, at any values: given weights have their own.
-_OF_RANDOM_WEIGHTS: dict[str, Any] = {"initial_std": 1.0, "initial_turn": 0.0}
+# Settings that may differ from those of given weights, at any values: of random weights, and of training alone.
+_FREE_OF_GIVEN_WEIGHTS: dict[str, Any] = {"initial_std": 1.0, "min_std": 0.01, "initial_turn": 0.0}
 
 
 def _params_to_start_from(config: TrainConfig) -> Params | None:
@@ -245,7 +245,7 @@ def _params_to_start_from(config: TrainConfig) -> Params | None:
     source, params, _ = load_policy(Path(config.start_from))
     for name, ours, theirs in (
         ("arch", config.arch, source.arch),
-        ("network", *(dataclasses.replace(one.network, **_OF_RANDOM_WEIGHTS) for one in (config, source))),
+        ("network", *(dataclasses.replace(one.network, **_FREE_OF_GIVEN_WEIGHTS) for one in (config, source))),
         ("observations", observation_shape(config.env), observation_shape(source.env)),
     ):
         require(ours == theirs, "start_from", config.start_from, f"a policy whose {name} is {ours}, not {theirs}")

@@ -189,12 +189,13 @@ def test_mean_is_bounded_only_where_asked(bounded: bool, overshoot: float) -> No
     np.testing.assert_allclose(output.mean[0], expected, atol=1e-6)
 
 
-def test_deviation_stays_in_its_range() -> None:
-    network = make_network("mlp", NetworkConfig(mlp_sizes=(8,)), (3,))
+@pytest.mark.parametrize(("settings", "least"), [({}, 0.01), ({"min_std": 0.2}, 0.2)])
+def test_deviation_stays_in_its_range(settings: dict[str, float], least: float) -> None:
+    network = make_network("mlp", NetworkConfig(mlp_sizes=(8,), **settings), (3,))
     params = network.init(jax.random.key(0))
     params["params"]["log_std"] = jnp.asarray([-50.0, 50.0])
     _, output = step(network, params, (), jnp.zeros((1, 3)), jnp.zeros(1))
-    np.testing.assert_allclose(np.exp(output.log_std), [0.01, 10.0], rtol=1e-5)
+    np.testing.assert_allclose(np.exp(output.log_std), [least, 10.0], rtol=1e-5)
 
 
 @pytest.mark.parametrize("arch", ["cnn", "mlp", "mlp_rocks"])

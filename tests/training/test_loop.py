@@ -110,7 +110,7 @@ def stop_after(config, updates):
 def test_training_starts_from_a_policy_where_one_is_named(config, tmp_path):
     policy = str(tmp_path / "run" / "policy")
     _, params, _ = load_policy(loop.Path(policy))
-    begins_otherwise = {"initial_turn": 0.3, "initial_std": 0.5}
+    begins_otherwise = {"initial_turn": 0.3, "initial_std": 0.5, "min_std": 0.2}
     more = replace_fields(config, start_from=policy, run="second", learning_rate=1e-9, **begins_otherwise)
     loop.train(more, **QUIET)
     again, moved, _ = load_policy(tmp_path / "second" / "policy")
