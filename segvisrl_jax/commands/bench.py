@@ -50,7 +50,7 @@ class BenchOptions:
     """physics, render, train; these three where none is named. policy, update: the network's decisions and an epoch of
     its learning. profile: where an update's time goes, by its parts and by the operations that take longest. start:
     what comes before a training's first update. peers: PyTorch and sb3-contrib beside this project (needs the extra
-    [sb3]). growth: time and memory against rocks, environments, image and unroll, one of them varied at a time; 20 to
+    [sb3]). growth: time and memory against rocks, environments, image and unroll, one of them varied at a time; 10 to
     25 minutes. Rows have the most memory that the process had until then, and the share of a limit that was measured
     beside them: of a large copy (physics, render) or of a large matrix product (policy, update, train, peers); for
     physics also of what mujoco.rollout, on all cores of the CPU, does alone."""
