@@ -11,6 +11,7 @@ import importlib
 import os
 import platform
 import queue
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -59,6 +60,7 @@ def open_gl_context(width_px: int, height_px: int) -> Any:
     else:
         modules = [wanted] if wanted else list(HEADLESS)
     reasons = []
+    _load_triton_first()
     for module in modules:
         try:
             return _open(module, width_px, height_px)
@@ -76,6 +78,13 @@ def _open(module: str, width_px: int, height_px: int) -> Any:
     context = importlib.import_module(f"mujoco.{module}").GLContext(width_px, height_px)
     context.make_current()
     return context
+
+
+def _load_triton_first() -> None:
+    """Triton, which PyTorch's optimisers import, has an LLVM of its own, and crashes behind Mesa's."""
+    if "torch" in sys.modules:
+        with contextlib.suppress(ImportError):  # PyTorch's wheels for CPUs come without it
+            importlib.import_module("triton")
 
 
 def _require_egl() -> None:

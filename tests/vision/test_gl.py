@@ -330,6 +330,17 @@ def test_a_script_that_forgets_to_close_frees_opengl_without_a_word():
     assert done.returncode == 0
 
 
+@pytest.mark.gl
+@pytest.mark.parametrize("torch", [False, True])
+def test_triton_is_loaded_before_opengl_where_pytorch_is(torch, tmp_path):
+    """Behind Mesa's LLVM it ends the process with a segmentation fault."""
+    (tmp_path / "triton.py").write_text("import sys\nprint('triton', 'OpenGL' in sys.modules)\n")
+    script = "import sys, types\n" + ("sys.modules['torch'] = types.ModuleType('torch')\n" if torch else "")
+    done = run_script(script + DRAW_ONE, PYTHONPATH=str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ("triton False\n" if torch else "") + "[0 1 2 3] (120, 214, 3)\n"
+
+
 @pytest.mark.parametrize("environment", [
     {"MUJOCO_EGL_DEVICE_ID": "1000", "PYOPENGL_PLATFORM": "egl"},  # no such device; no OSMesa
     {"PYOPENGL_PLATFORM": "glx"},  # neither of MuJoCo's modules can be imported then
