@@ -81,8 +81,11 @@ def _open(module: str, width_px: int, height_px: int) -> Any:
 
 
 def _load_triton_first() -> None:
-    """Triton, which PyTorch's optimisers import, has an LLVM of its own, and crashes behind Mesa's."""
-    if "torch" in sys.modules:
+    """Triton, which PyTorch's optimisers import, has an LLVM of its own, and crashes behind Mesa's.
+
+    Not where OpenGL is here already: then it would crash now, and perhaps nobody needs it.
+    """
+    if "torch" in sys.modules and "OpenGL" not in sys.modules:
         with contextlib.suppress(ImportError):  # PyTorch's wheels for CPUs come without it
             importlib.import_module("triton")
 

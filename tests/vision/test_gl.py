@@ -341,6 +341,18 @@ def test_triton_is_loaded_before_opengl_where_pytorch_is(torch, tmp_path):
     assert done.stdout == ("triton False\n" if torch else "") + "[0 1 2 3] (120, 214, 3)\n"
 
 
+@pytest.mark.gl
+def test_triton_is_not_loaded_behind_opengl(tmp_path):
+    (tmp_path / "triton.py").write_text("raise SystemError")
+    done = run_script(
+        "import sys, types\nfrom segvisrl_jax.vision.gl_context import open_gl_context\n"
+        "first = open_gl_context(16, 16)\nsys.modules['torch'] = types.ModuleType('torch')\n"
+        "second = open_gl_context(16, 16)\nsecond.free()\nfirst.free()\n",
+        PYTHONPATH=str(tmp_path),
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 @pytest.mark.parametrize("environment", [
     {"MUJOCO_EGL_DEVICE_ID": "1000", "PYOPENGL_PLATFORM": "egl"},  # no such device; no OSMesa
     {"PYOPENGL_PLATFORM": "glx"},  # neither of MuJoCo's modules can be imported then
