@@ -152,10 +152,10 @@ def test_a_disk_that_fails_ends_in_one_line(error, said, monkeypatch, capsys):
 
 
 def test_a_working_folder_that_is_gone_ends_in_one_line(tmp_path):
-    command = Path(sys.executable).with_name("segvisrl")
+    command = shlex.quote(str(Path(sys.executable).with_name("segvisrl")))
     (tmp_path / "gone").mkdir()
-    left = f"cd {tmp_path}/gone && rmdir {tmp_path}/gone && exec {command} train --preset smoke"
-    done = subprocess.run(["sh", "-c", left], capture_output=True, text=True)
+    left = f"rmdir {shlex.quote(str(tmp_path / 'gone'))} && exec {command} train --preset smoke"
+    done = subprocess.run(["sh", "-c", left], cwd=tmp_path / "gone", capture_output=True, text=True)
     assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
 
 
