@@ -15,6 +15,7 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import mujoco
@@ -27,6 +28,7 @@ Result = TypeVar("Result")
 
 HEADLESS = ("egl", "osmesa")  # in the order tried on Linux: EGL may reach a GPU, OSMesa never does
 SWITCHED_OFF = ("disable", "disabled", "off", "false", "0")  # values of MUJOCO_GL, MuJoCo's own
+LOADED = Path("/proc/self/maps")  # on Linux: the libraries of this process, among others
 OSMESA_LIBRARIES = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
 MAX_EGL_DEVICES = 10  # as many as MuJoCo looks at
 EGL_PLATFORM_DEVICE_EXT = 0x313F  # from the EGL_EXT_platform_device extension
@@ -83,9 +85,9 @@ def _open(module: str, width_px: int, height_px: int) -> Any:
 def _load_triton_first() -> None:
     """Triton, which PyTorch's optimisers import, has an LLVM of its own, and crashes behind Mesa's.
 
-    Not where OpenGL is here already: then it would crash now, and perhaps nobody needs it.
+    Not where Mesa's is here already: then it would crash now, and perhaps nobody needs it.
     """
-    if "torch" in sys.modules and "OpenGL" not in sys.modules:
+    if "torch" in sys.modules and LOADED.exists() and "libLLVM" not in LOADED.read_text():
         with contextlib.suppress(ImportError):  # PyTorch's wheels for CPUs come without it
             importlib.import_module("triton")
 

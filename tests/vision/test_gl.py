@@ -297,10 +297,10 @@ def test_the_thread_hands_back_errors_and_cleans_up_once():
 
 
 DRAW_ONE = """
-import sys, threading
+import os, sys, threading
 import numpy as np
 import segvisrl_jax, segvisrl_jax.vision.gl as gl
-assert "OpenGL" not in sys.modules and threading.active_count() == 1
+assert ("OpenGL" in sys.modules) == bool(os.environ.get("MUJOCO_GL")) and threading.active_count() == 1
 from segvisrl_jax.config import EnvConfig
 from segvisrl_jax.types import CameraPose, Scene
 f, i = np.float32, np.int32
@@ -330,24 +330,31 @@ def test_a_script_that_forgets_to_close_frees_opengl_without_a_word():
     assert done.returncode == 0
 
 
+TRITON = """
+if 'libLLVM' in open('/proc/self/maps').read():
+    raise SystemError('behind the LLVM of Mesa')
+print('triton')
+"""
+IMPORT_TORCH = "import sys, types\nsys.modules['torch'] = types.ModuleType('torch')\n"
+
+
 @pytest.mark.gl
+@pytest.mark.parametrize("backend", ["", "egl"])  # with MUJOCO_GL set MuJoCo imports PyOpenGL at once
 @pytest.mark.parametrize("torch", [False, True])
-def test_triton_is_loaded_before_opengl_where_pytorch_is(torch, tmp_path):
+def test_triton_is_loaded_before_opengl_where_pytorch_is(torch, backend, tmp_path):
     """Behind Mesa's LLVM it ends the process with a segmentation fault."""
-    (tmp_path / "triton.py").write_text("import sys\nprint('triton', 'OpenGL' in sys.modules)\n")
-    script = "import sys, types\n" + ("sys.modules['torch'] = types.ModuleType('torch')\n" if torch else "")
-    done = run_script(script + DRAW_ONE, PYTHONPATH=str(tmp_path))
+    (tmp_path / "triton.py").write_text(TRITON)
+    done = run_script((IMPORT_TORCH if torch else "") + DRAW_ONE, PYTHONPATH=str(tmp_path), MUJOCO_GL=backend)
     assert done.returncode == 0, done.stderr
-    assert done.stdout == ("triton False\n" if torch else "") + "[0 1 2 3] (120, 214, 3)\n"
+    assert done.stdout == ("triton\n" if torch else "") + "[0 1 2 3] (120, 214, 3)\n"
 
 
 @pytest.mark.gl
 def test_triton_is_not_loaded_behind_opengl(tmp_path):
-    (tmp_path / "triton.py").write_text("raise SystemError")
+    (tmp_path / "triton.py").write_text(TRITON)
     done = run_script(
-        "import sys, types\nfrom segvisrl_jax.vision.gl_context import open_gl_context\n"
-        "first = open_gl_context(16, 16)\nsys.modules['torch'] = types.ModuleType('torch')\n"
-        "second = open_gl_context(16, 16)\nsecond.free()\nfirst.free()\n",
+        "from segvisrl_jax.vision.gl_context import open_gl_context\nfirst = open_gl_context(16, 16)\n"
+        f"{IMPORT_TORCH}second = open_gl_context(16, 16)\nsecond.free()\nfirst.free()\n",
         PYTHONPATH=str(tmp_path),
     )
     assert (done.returncode, done.stderr) == (0, "")
