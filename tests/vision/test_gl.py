@@ -300,7 +300,7 @@ DRAW_ONE = """
 import os, sys, threading
 import numpy as np
 import segvisrl_jax, segvisrl_jax.vision.gl as gl
-assert ("OpenGL" in sys.modules) == bool(os.environ.get("MUJOCO_GL")) and threading.active_count() == 1
+assert ("OpenGL" in sys.modules) == (os.environ.get("MUJOCO_GL") == "egl") and threading.active_count() == 1
 from segvisrl_jax.config import EnvConfig
 from segvisrl_jax.types import CameraPose, Scene
 f, i = np.float32, np.int32
