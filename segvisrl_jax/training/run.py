@@ -222,12 +222,14 @@ class Run:
         try:
             if self._policy is None or not self._policy_is_waiting:
                 return
-            params, scores = self._policy
-            write = functools.partial(save_policy, self.folder / "policy", self.config, params, scores)
-            if self._try("the best policy", write):
-                self._policy_is_waiting, self._best_on_disk = False, _rank(scores)
+            if self._try("the best policy", functools.partial(self._replace_policy, *self._policy)):
+                self._policy_is_waiting, self._best_on_disk = False, _rank(self._policy[1])
         finally:
             self._writing_policy.release()
+
+    def _replace_policy(self, params: Params, scores: dict[str, Any]) -> None:
+        (self.folder / "eval.json").unlink(missing_ok=True)  # of a run that was over, and of its policy
+        save_policy(self.folder / "policy", self.config, params, scores)
 
     def _require_ours(self) -> None:
         """Nothing is written into another run's folder; where it cannot be looked at, writing says why.

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from segvisrl_jax.config import ConditionsConfig, ConfigError, preset_config, replace_fields
-from segvisrl_jax.training import loop
+from segvisrl_jax.training import loop, run
 from segvisrl_jax.training.checkpoint import MARK, Checkpoints, load_policy, save_policy
 from segvisrl_jax.training.metrics import read_metrics
 
@@ -173,6 +173,16 @@ def test_a_run_leaves_its_files(config, tmp_path):
     assert stored == replace_fields(config, runs_dir="runs")  # names no folder of this machine
     assert scores["episodes"] == 4
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
+
+
+@pytest.mark.parametrize("rank", [1.0, -1.0])  # of the later policies: better and worse than the one that is there
+def test_a_policy_that_is_replaced_takes_its_evaluation_with_it(rank, config, tmp_path, monkeypatch):
+    policy, evaluation = tmp_path / "run" / "policy" / "policy.json", tmp_path / "run" / "eval.json"
+    evaluation.write_text("{}")
+    before = policy.read_bytes()
+    monkeypatch.setattr(run, "_rank", lambda scores: [0.0 if scores.get("decisions") == 64 else rank])
+    assert loop.train(replace_fields(config, steps=128, resume=True), **QUIET).decisions == 128
+    assert (policy.read_bytes() == before) == evaluation.exists() == (rank < 0)
 
 
 def test_an_existing_run_is_not_overwritten(config, tmp_path):
