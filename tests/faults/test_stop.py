@@ -135,6 +135,7 @@ def test_a_signal_during_the_last_update_is_heard(tmp_path, monkeypatch, capsys)
         return evaluate(trainer, params, seed)
 
     monkeypatch.setattr(loop.Trainer, "evaluate", evaluate_and_be_told)
+    monkeypatch.setattr(StopSignals.__init__, "__defaults__", (600.0, None))  # or a slow machine ends the tests
     smallest = ("--steps", "128", "--evaluation.episodes", "4", "--env.task.max-decisions", "12")
     place = ("--runs-dir", str(tmp_path), "--run", "run")
     assert train.run(["--arch", "mlp", "--preset", "smoke", *smallest, *place]) == INTERRUPTED
