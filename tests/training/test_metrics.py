@@ -79,15 +79,18 @@ def failing(*given):
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-@pytest.fixture
-def size_limit():
-    """Sets the size beyond which this process can write to no file, and lifts it again."""
+@contextlib.contextmanager
+def size_limit(size):
+    """The size beyond which this process can write to no file; lifted before pytest writes of the test."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (before[0] if size is None else size, before[1]))
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def test_a_file_that_vanished_is_whole_again_or_not_there(tmp_path, size_limit):
+def test_a_file_that_vanished_is_whole_again_or_not_there(tmp_path):
     """It vanishes when there is room for half of it."""
     said, lines, path = [], [], tmp_path / "metrics.jsonl"
     with MetricsWriter(tmp_path, tensorboard=False, say=said.append) as writer:
@@ -95,10 +98,9 @@ def test_a_file_that_vanished_is_whole_again_or_not_there(tmp_path, size_limit):
             writer.write(step, {"a": step})
         lines = path.read_bytes()
         path.unlink()
-        size_limit(len(lines) // 2)
-        writer.write(200, {"a": 200})
+        with size_limit(len(lines) // 2):
+            writer.write(200, {"a": 200})
         assert not path.exists()
-        size_limit(None)
         writer.write(201, {"a": 201})
         assert [row["step"] for row in read_metrics(tmp_path)] == list(range(202))
     assert path.read_bytes().startswith(lines)
@@ -107,14 +109,13 @@ def test_a_file_that_vanished_is_whole_again_or_not_there(tmp_path, size_limit):
     assert said[1] == "metrics.jsonl is written again"
 
 
-def test_a_disk_that_is_full_for_long_gets_no_empty_event_files(tmp_path, size_limit):
+def test_a_disk_that_is_full_for_long_gets_no_empty_event_files(tmp_path):
     board = TensorBoard(tmp_path)
-    size_limit(0)
-    for step in range(3):
-        with pytest.raises(OSError, match="File too large"):
-            board.log(step, {"a": 1.0})
+    with size_limit(0):
+        for step in range(3):
+            with pytest.raises(OSError, match="File too large"):
+                board.log(step, {"a": 1.0})
     assert list((tmp_path / "tensorboard").iterdir()) == []
-    size_limit(None)
     board.log(3, {"a": 1.0})
     board.close()
     assert scalars(tmp_path, "a") == [(3, 1.0)]
@@ -131,11 +132,12 @@ def test_a_copy_in_its_place_is_written_to(tmp_path):
     assert [row["step"] for row in read_metrics(tmp_path)] == [0, 1]
 
 
-def test_closing_does_not_say_that_what_is_lost_was_written(tmp_path, size_limit):
+def test_closing_does_not_say_that_what_is_lost_was_written(tmp_path):
     said = []
-    with MetricsWriter(tmp_path, tensorboard=False, say=said.append) as writer:
+    writer = MetricsWriter(tmp_path, tensorboard=False, say=said.append)
+    with contextlib.ExitStack() as until_closed, writer:
         writer.write(1, {"a": 1})
-        size_limit((tmp_path / "metrics.jsonl").stat().st_size)
+        until_closed.enter_context(size_limit((tmp_path / "metrics.jsonl").stat().st_size))
         writer.write(2, {"a": 2})
         assert writer.catch_up() == 1
     assert len(said) == 1
