@@ -288,7 +288,7 @@ def _tick(field: str, value: float, evaluations: Sequence[Evaluation]) -> str:
         return f"{value:g}"
     camera: CameraConfig = dataclasses.replace(evaluations[0].config.camera, scale=value)
     rows, columns = camera.observation_size_px
-    return f"{value:g}\n{columns} x {rows}"
+    return f"{value:g}\n{columns}\nx {rows}"
 
 
 def axis_name(field: str) -> str:

@@ -164,7 +164,7 @@ def test_what_does_not_look_is_level_over_the_cameras_settings(tmp_path, drawn):
     level = success.lines[-1]
     np.testing.assert_array_equal(level.get_xdata(), [10, 20, 30])
     np.testing.assert_array_equal(level.get_ydata(), [0.9, 0.9, 0.9])
-    assert success.get_xticklabels()[0].get_text() == "10\n192 x 108"
+    assert success.get_xticklabels()[0].get_text() == "10\n192\nx 108"
     assert success.get_xscale() == "linear"
 
 
